@@ -1,0 +1,187 @@
+"""Signed distances of the manipulators in their local frames, outward normals, and the derivative of the normals.
+
+The entries of `Tool.size`: Sphere (radius), Capsule (radius, height), Box (half extents, rounding), Cylinder (radius, half
+height), Torus (major radius, tube radius); lengths.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from cpdeform.backends.warp.kernels_types import BOX, CAPSULE, CYLINDER, SPHERE, TORUS, build_types
+
+
+@functools.cache
+def build_distance(real: Any) -> SimpleNamespace:
+    """Warp functions of signed distances and rotations for one scalar type."""
+    types = build_types(real)
+    vec3, vec4, vec8, Tool = types.vec3, types.vec4, types.vec8, types.Tool
+    zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
+    # PlasticineLab's length: finite gradient at zero
+    length_regularization = real(1e-8)
+
+    @wp.func
+    def length(v: vec3):
+        return wp.sqrt(wp.dot(v, v) + length_regularization)
+
+    @wp.func
+    def box_offset(p: vec3, b: vec3):
+        """Vector from the box's nearest point to p; zero inside."""
+        return p - wp.min(wp.max(p, -b), b)
+
+    @wp.func
+    def largest_axis(q: vec3):
+        axis = int(0)
+        if q[1] > q[axis]:
+            axis = int(1)
+        if q[2] > q[axis]:
+            axis = int(2)
+        return axis
+
+    @wp.func
+    def sign(x: real):
+        result = one
+        if x < zero:
+            result = -one
+        return result
+
+    @wp.func
+    def radial_unit(p: vec3):
+        """Unit vector away from the y axis, and the distance from it."""
+        r = wp.sqrt(p[0] * p[0] + p[2] * p[2] + length_regularization)
+        return vec3(p[0] / r, zero, p[2] / r), r
+
+    @wp.func
+    def distance_and_normal(kind: int, size: vec4, p: vec3):
+        """Signed distance and outward normal at the local point p, as (normal, distance)."""
+        distance = zero
+        normal = vec3(zero, one, zero)
+        if kind == wp.static(SPHERE):
+            r = length(p)
+            distance = r - size[0]
+            normal = p / r
+        if kind == wp.static(CAPSULE):
+            h = half * size[1]
+            q = vec3(p[0], p[1] - wp.min(wp.max(p[1], -h), h), p[2])
+            r = length(q)
+            distance = r - size[0]
+            normal = q / r
+        if kind == wp.static(BOX):
+            b = vec3(size[0], size[1], size[2])
+            q = wp.abs(p) - b
+            axis = largest_axis(q)
+            if q[axis] > zero:
+                o = box_offset(p, b)
+                r = wp.sqrt(wp.dot(o, o))
+                distance = r - size[3]
+                normal = o / r
+            else:
+                distance = q[axis] - size[3]
+                normal = vec3(zero, zero, zero)
+                normal[axis] = sign(p[axis])
+        if kind == wp.static(CYLINDER):
+            u, r = radial_unit(p)
+            side = r - size[0]
+            top = wp.abs(p[1]) - size[1]
+            up = vec3(zero, sign(p[1]), zero)
+            if side > zero and top > zero:
+                distance = wp.sqrt(side * side + top * top)
+                normal = (side / distance) * u + (top / distance) * up
+            else:
+                distance = wp.max(side, top)
+                normal = up
+                if side > top:
+                    normal = u
+        if kind == wp.static(TORUS):
+            u, r = radial_unit(p)
+            q = (r - size[0]) * u + vec3(zero, p[1], zero)
+            s = length(q)
+            distance = s - size[1]
+            normal = q / s
+        return normal, distance
+
+    @wp.func
+    def project(g: vec3, normal: vec3):
+        return g - wp.dot(g, normal) * normal
+
+    @wp.func
+    def normal_adjoint(kind: int, size: vec4, p: vec3, g: vec3):
+        """(d normal / d p)^T g; the derivative is a symmetric matrix, the distance's Hessian."""
+        result = vec3(zero, zero, zero)
+        if kind == wp.static(SPHERE):
+            r = length(p)
+            result = project(g, p / r) / r
+        if kind == wp.static(CAPSULE):
+            h = half * size[1]
+            q = vec3(p[0], p[1] - wp.min(wp.max(p[1], -h), h), p[2])
+            r = length(q)
+            result = project(g, q / r) / r
+            if wp.abs(p[1]) < h:
+                result[1] = zero
+        if kind == wp.static(BOX):
+            b = vec3(size[0], size[1], size[2])
+            q = wp.abs(p) - b
+            if wp.max(q[0], wp.max(q[1], q[2])) > zero:
+                o = box_offset(p, b)
+                r = wp.sqrt(wp.dot(o, o))
+                result = project(g, o / r) / r
+                for axis in range(3):
+                    if q[axis] <= zero:
+                        result[axis] = zero
+        if kind == wp.static(CYLINDER):
+            u, r = radial_unit(p)
+            side = r - size[0]
+            top = wp.abs(p[1]) - size[1]
+            around = vec3(-u[2], zero, u[0])
+            turn = wp.dot(g, around) / r * around
+            if side > zero and top > zero:
+                d = wp.sqrt(side * side + top * top)
+                normal = (side / d) * u + vec3(zero, sign(p[1]) * top / d, zero)
+                across = project(vec3(zero, one, zero), normal)
+                across = across / wp.max(wp.sqrt(wp.dot(across, across)), real(1e-6))
+                result = (side / d) * turn + wp.dot(g, across) / d * across
+            elif side > top:
+                result = turn
+        if kind == wp.static(TORUS):
+            u, r = radial_unit(p)
+            q = (r - size[0]) * u + vec3(zero, p[1], zero)
+            s = length(q)
+            normal = q / s
+            around = vec3(-u[2], zero, u[0])
+            planar = g - wp.dot(g, around) * around
+            result = project(planar, normal) / s + ((r - size[0]) / (r * s)) * wp.dot(g, around) * around
+        return result
+
+    @wp.func
+    def pose_position(pose: vec8):
+        return vec3(pose[0], pose[1], pose[2])
+
+    @wp.func
+    def pose_axis(pose: vec8):
+        """Vector part of the pose's quaternion; its scalar part is pose[3]."""
+        return vec3(pose[4], pose[5], pose[6])
+
+    @wp.func
+    def rotate(w: real, u: vec3, v: vec3):
+        """Rotate v by the unit quaternion (w, u); by its inverse with (w, -u)."""
+        c = wp.cross(u, v)
+        return v + two * (w * c + wp.cross(u, c))
+
+    @wp.func
+    def rotate_adjoint(w: real, u: vec3, v: vec3, g: vec3):
+        """Gradients with respect to the quaternion (vec4, wxyz)."""
+        c = wp.cross(u, v)
+        gc = wp.cross(g, u)
+        gu = two * (w * wp.cross(v, g) + wp.cross(c, g) + wp.cross(v, gc))
+        return vec4(two * wp.dot(g, c), gu[0], gu[1], gu[2])
+
+    return SimpleNamespace(
+        distance_and_normal=distance_and_normal,
+        normal_adjoint=normal_adjoint,
+        pose_position=pose_position,
+        pose_axis=pose_axis,
+        rotate=rotate,
+        rotate_adjoint=rotate_adjoint,
+    )

@@ -1,0 +1,274 @@
+"""The material: trial strain, return mapping, stress, and the adjoint of all three.
+
+State is the elastic strain e = b - I with b = F F^T. For a trial e* = U diag(l) U^T, both the new strain and the stress share the
+eigenvectors U (the model is isotropic), so a symmetric 3x3 eigendecomposition replaces the SVD of F. The adjoint is the
+Daleckii-Krein formula; its divided differences are written in closed forms that do not cancel where eigenvalues meet.
+
+References:
+    de Souza Neto, Peric, Owen, "Computational Methods for Plasticity", 2008, chapter 14 and appendix A (isotropic functions).
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from cpdeform.backends.warp.kernels_types import build_types
+
+
+@functools.cache
+def build_material(real: Any) -> SimpleNamespace:
+    """Warp functions of the material model for one scalar type."""
+    types = build_types(real)
+    vec3, vec6, mat33 = types.vec3, types.vec6, types.mat33
+    zero, half, one, two, third = real(0.0), real(0.5), real(1.0), real(2.0), real(1.0 / 3.0)
+    smallest_stretch_squared = real(0.05 * 0.05 - 1.0)
+    jacobi_tolerance = real(1e-14 if real is wp.float32 else 1e-30)
+    norm_regularization = real(1e-8)
+
+    @wp.func
+    def log1p(x: real):
+        w = one + x
+        result = x
+        if w != one:
+            result = wp.log(w) * x / (w - one)
+        return result
+
+    @wp.func
+    def expm1(x: real):
+        result = wp.exp(x) - one
+        if wp.abs(x) < real(0.25):
+            result = x * (one + x * half * (one + x * third * (one + x * real(0.25) * (one + x * real(0.2) * (
+                one + x * real(1.0 / 6.0) * (one + x * real(1.0 / 7.0) * (one + x * real(0.125))))))))
+        return result
+
+    @wp.func
+    def sinhc(x: real):
+        x2 = x * x
+        result = one + x2 * real(1.0 / 6.0) * (one + x2 * real(1.0 / 20.0) * (one + x2 * real(1.0 / 42.0)))
+        if x2 > real(0.25):
+            result = half * (wp.exp(x) - wp.exp(-x)) / x
+        return result
+
+    @wp.func
+    def symmetric(e: vec6):
+        return mat33(e[0], e[3], e[4], e[3], e[1], e[5], e[4], e[5], e[2])
+
+    @wp.func
+    def entries(m: mat33):
+        return vec6(m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2])
+
+    @wp.func
+    def rotation_tangent(app: real, aqq: real, apq: real):
+        t = zero
+        if apq != zero:
+            theta = (aqq - app) / (two * apq)
+            t = one / (wp.abs(theta) + wp.sqrt(theta * theta + one))
+            if theta < zero:
+                t = -t
+        return t
+
+    @wp.func
+    def eigen(e: vec6):
+        """Cyclic Jacobi: eigenvalues and eigenvectors (as three vectors) of a symmetric matrix."""
+        a00, a11, a22 = e[0], e[1], e[2]
+        a01, a02, a12 = e[3], e[4], e[5]
+        u0 = vec3(one, zero, zero)
+        u1 = vec3(zero, one, zero)
+        u2 = vec3(zero, zero, one)
+        sweep = int(0)
+        off = a01 * a01 + a02 * a02 + a12 * a12
+        while sweep < 8 and off > jacobi_tolerance * (a00 * a00 + a11 * a11 + a22 * a22 + off):
+            t = rotation_tangent(a00, a11, a01)
+            c = one / wp.sqrt(one + t * t)
+            s = t * c
+            a00 = a00 - t * a01
+            a11 = a11 + t * a01
+            a01 = zero
+            p = c * a02 - s * a12
+            a12 = s * a02 + c * a12
+            a02 = p
+            w = c * u0 - s * u1
+            u1 = s * u0 + c * u1
+            u0 = w
+
+            t = rotation_tangent(a00, a22, a02)
+            c = one / wp.sqrt(one + t * t)
+            s = t * c
+            a00 = a00 - t * a02
+            a22 = a22 + t * a02
+            a02 = zero
+            p = c * a01 - s * a12
+            a12 = s * a01 + c * a12
+            a01 = p
+            w = c * u0 - s * u2
+            u2 = s * u0 + c * u2
+            u0 = w
+
+            t = rotation_tangent(a11, a22, a12)
+            c = one / wp.sqrt(one + t * t)
+            s = t * c
+            a11 = a11 - t * a12
+            a22 = a22 + t * a12
+            a12 = zero
+            p = c * a01 - s * a02
+            a02 = s * a01 + c * a02
+            a01 = p
+            w = c * u1 - s * u2
+            u2 = s * u1 + c * u2
+            u1 = w
+
+            off = a01 * a01 + a02 * a02 + a12 * a12
+            sweep += 1
+        return vec3(a00, a11, a22), u0, u1, u2
+
+    @wp.func
+    def trial_strain(e: vec6, affine: mat33, time_step: real):
+        """e* = (I + D)(I + e)(I + D)^T - I with D = dt C, without the cancellation."""
+        d = time_step * affine
+        m = symmetric(e)
+        de = d * m
+        return entries(m + d + wp.transpose(d) + de + wp.transpose(de) + (d + de) * wp.transpose(d))
+
+    @wp.func
+    def return_map(trial: vec3, mu: real, yield_stress: real):
+        """Return mapping on the trial eigenvalues.
+
+        Returns the stretches minus one, the Hencky strains after it, the trial's deviator, its norm, and the factor k that the
+        deviator was scaled by (0 marks the elastic branch, in which nothing was changed).
+        """
+        h = vec3(
+            half * log1p(wp.max(trial[0], smallest_stretch_squared)),
+            half * log1p(wp.max(trial[1], smallest_stretch_squared)),
+            half * log1p(wp.max(trial[2], smallest_stretch_squared)),
+        )
+        mean = third * (h[0] + h[1] + h[2])
+        deviator = h - vec3(mean, mean, mean)
+        norm = wp.sqrt(wp.dot(deviator, deviator) + norm_regularization)
+        limit = yield_stress / (two * mu)
+        factor = zero
+        stretch = vec3(zero, zero, zero)
+        if norm > limit:
+            factor = limit / norm
+            h = vec3(mean, mean, mean) + factor * deviator
+            stretch = vec3(expm1(h[0]), expm1(h[1]), expm1(h[2]))
+        else:
+            floor = real(-1.0)
+            stretch = vec3(
+                trial[0] / (one + wp.sqrt(wp.max(one + trial[0], zero))),
+                trial[1] / (one + wp.sqrt(wp.max(one + trial[1], zero))),
+                trial[2] / (one + wp.sqrt(wp.max(one + trial[2], zero))),
+            )
+            stretch = vec3(wp.max(stretch[0], floor), wp.max(stretch[1], floor), wp.max(stretch[2], floor))
+        return stretch, h, deviator, norm, factor
+
+    @wp.func
+    def principal_stress(a: vec3, mu: real, lam: real):
+        """Principal Kirchhoff stresses 2 mu (s-1) s + lambda J (J-1) of stretches s = 1 + a."""
+        j1 = a[0] + a[1] + a[2] + a[0] * a[1] + a[0] * a[2] + a[1] * a[2] + a[0] * a[1] * a[2]
+        pressure = lam * (one + j1) * j1
+        return vec3(
+            two * mu * a[0] * (one + a[0]) + pressure,
+            two * mu * a[1] * (one + a[1]) + pressure,
+            two * mu * a[2] * (one + a[2]) + pressure,
+        )
+
+    @wp.func
+    def compose(d: vec3, u0: vec3, u1: vec3, u2: vec3):
+        return d[0] * wp.outer(u0, u0) + d[1] * wp.outer(u1, u1) + d[2] * wp.outer(u2, u2)
+
+    @wp.func
+    def material(trial: vec6, mu: real, lam: real, yield_stress: real):
+        """New elastic strain (six entries) and Kirchhoff stress (matrix) of a trial strain."""
+        values, u0, u1, u2 = eigen(trial)
+        a, h, deviator, norm, factor = return_map(values, mu, yield_stress)
+        new = trial
+        if factor > zero:
+            squared = vec3(a[0] * (two + a[0]), a[1] * (two + a[1]), a[2] * (two + a[2]))
+            new = entries(compose(squared, u0, u1, u2))
+        return new, compose(principal_stress(a, mu, lam), u0, u1, u2)
+
+    @wp.func
+    def stretch_slope(si: real, sj: real, hi: real, hj: real, ti: real, tj: real, xi: real, xj: real, factor: real):
+        """Divided difference (s_i - s_j) / (l_i - l_j) of new stretches over trial eigenvalues, exact where they meet."""
+        slope = one / wp.max(si + sj, real(1e-6))
+        if factor > zero:
+            if xi > smallest_stretch_squared and xj > smallest_stretch_squared:
+                gap = ti - tj
+                slope = half * factor * wp.exp(half * (hi + hj) - (ti + tj)) * sinhc(half * factor * gap) / sinhc(gap)
+            else:
+                slope = zero
+                if wp.abs(xi - xj) > real(1e-6):
+                    slope = (si - sj) / (xi - xj)
+        return slope
+
+    @wp.func
+    def material_adjoint(trial: vec6, mu: real, lam: real, yield_stress: real, grad_new: mat33, grad_stress: mat33):
+        """Gradient (symmetric matrix) with respect to the trial strain."""
+        values, u0, u1, u2 = eigen(trial)
+        a, h, deviator, norm, factor = return_map(values, mu, yield_stress)
+        s = vec3(one + a[0], one + a[1], one + a[2])
+        j = s[0] * s[1] * s[2]
+        gt0, gt1, gt2 = grad_stress * u0, grad_stress * u1, grad_stress * u2
+        ge0, ge1, ge2 = grad_new * u0, grad_new * u1, grad_new * u2
+        t00, t11, t22 = wp.dot(u0, gt0), wp.dot(u1, gt1), wp.dot(u2, gt2)
+        e00, e11, e22 = wp.dot(u0, ge0), wp.dot(u1, ge1), wp.dot(u2, ge2)
+        # d tau / d s: the pressure lambda J (J-1) depends on every stretch
+        pressure = (t00 + t11 + t22) * lam * (two * j - one)
+        gs = vec3(
+            two * mu * (two * s[0] - one) * t00 + pressure * s[1] * s[2],
+            two * mu * (two * s[1] - one) * t11 + pressure * s[0] * s[2],
+            two * mu * (two * s[2] - one) * t22 + pressure * s[0] * s[1],
+        )
+        gl = vec3(zero, zero, zero)
+        trial_h = h
+        if factor > zero:
+            mean = third * (h[0] + h[1] + h[2])
+            trial_h = deviator + vec3(mean, mean, mean)
+            gh = vec3(
+                (gs[0] + two * s[0] * e00) * s[0], (gs[1] + two * s[1] * e11) * s[1], (gs[2] + two * s[2] * e22) * s[2]
+            )
+            average = third * (gh[0] + gh[1] + gh[2])
+            bend = factor / (norm * norm) * wp.dot(gh, deviator)
+            for i in range(3):
+                if values[i] > smallest_stretch_squared:
+                    slope = average + factor * (gh[i] - average) - bend * deviator[i]
+                    gl[i] = slope * half / (one + values[i])
+        else:
+            gl = vec3(
+                gs[0] * half / wp.max(s[0], real(1e-6)) + e00,
+                gs[1] * half / wp.max(s[1], real(1e-6)) + e11,
+                gs[2] * half / wp.max(s[2], real(1e-6)) + e22,
+            )
+        r01 = stretch_slope(s[0], s[1], h[0], h[1], trial_h[0], trial_h[1], values[0], values[1], factor)
+        r02 = stretch_slope(s[0], s[2], h[0], h[2], trial_h[0], trial_h[2], values[0], values[2], factor)
+        r12 = stretch_slope(s[1], s[2], h[1], h[2], trial_h[1], trial_h[2], values[1], values[2], factor)
+        t01, t02, t12 = wp.dot(u0, gt1), wp.dot(u0, gt2), wp.dot(u1, gt2)
+        e01, e02, e12 = wp.dot(u0, ge1), wp.dot(u0, ge2), wp.dot(u1, ge2)
+        h01 = r01 * (two * mu * (s[0] + s[1] - one) * t01 + (s[0] + s[1]) * e01)
+        h02 = r02 * (two * mu * (s[0] + s[2] - one) * t02 + (s[0] + s[2]) * e02)
+        h12 = r12 * (two * mu * (s[1] + s[2] - one) * t12 + (s[1] + s[2]) * e12)
+        m01 = wp.outer(u0, u1)
+        m02 = wp.outer(u0, u2)
+        m12 = wp.outer(u1, u2)
+        mixed = h01 * m01 + h02 * m02 + h12 * m12
+        return compose(gl, u0, u1, u2) + mixed + wp.transpose(mixed)
+
+    @wp.func
+    def trial_adjoint(e: vec6, affine: mat33, time_step: real, grad_trial: mat33):
+        """Gradients with respect to the old strain (symmetric matrix) and the affine field, from that of the trial strain."""
+        identity = mat33(one, zero, zero, zero, one, zero, zero, zero, one)
+        f = identity + time_step * affine
+        gf = grad_trial * f
+        return wp.transpose(f) * gf, (two * time_step) * (gf + gf * symmetric(e))
+
+    return SimpleNamespace(
+        symmetric=symmetric,
+        entries=entries,
+        trial_strain=trial_strain,
+        material=material,
+        material_adjoint=material_adjoint,
+        trial_adjoint=trial_adjoint,
+        eigen=eigen,
+    )

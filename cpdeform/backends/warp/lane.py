@@ -1,0 +1,203 @@
+"""A lane: worlds that are launched together, substep by substep, forwards and backwards.
+
+On the CPU a lane is one world, its grid covers the particles' bounding box, and particles may be split into blocks that scatter
+to grid rows of their own, so that several threads work on one world. On CUDA a lane is the whole batch on the full grid.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+
+@dataclasses.dataclass(frozen=True)
+class Particles:
+    """Warp arrays (W, N): position, velocity, affine, elastic strain; or the gradients with respect to them."""
+
+    position: Any
+    velocity: Any
+    affine: Any
+    strain: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Substep:
+    """What a substep's adjoint needs: the particles before it, and momentum and mass on the grid.
+
+    Attributes:
+        particles: Particles before the substep.
+        grid: Momentum and mass (rows, nodes); the first W rows hold the sums.
+        origin: First node of the grid along each axis.
+        size: Nodes of the grid along each axis.
+    """
+
+    particles: Particles
+    grid: Any
+    origin: Any
+    size: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """What all lanes of a simulator share.
+
+    Attributes:
+        types: Vector types, see `kernels_types`.
+        kernels: All kernels.
+        parameters: Constants of the scene.
+        tools: Manipulators.
+        constants: Material of each particle.
+        substeps: Substeps per environment step.
+        device: Warp's name of the device.
+    """
+
+    types: SimpleNamespace
+    kernels: SimpleNamespace
+    parameters: Any
+    tools: Any
+    constants: Any
+    substeps: int
+    device: str
+
+
+class Lane:
+    """Runs substeps for W worlds.
+
+    Args:
+        program: Kernels and constants.
+        worlds: Number of worlds W in this lane; 1 on the CPU.
+        particle_count: Particles N of a world.
+        pool: Threads for the blocks of one world; None for a single block.
+        blocks: Number of blocks.
+    """
+
+    def __init__(
+        self, program: Program, *, worlds: int, particle_count: int, pool: ThreadPoolExecutor | None = None, blocks: int = 1
+    ) -> None:
+        self.program = program
+        self.worlds = worlds
+        self.particle_count = particle_count
+        self._pool = pool
+        self.blocks = blocks if pool is not None else 1
+        self._on_cpu = program.device == "cpu"
+        if self._on_cpu:
+            self._bounds = wp.zeros(2, dtype=wp.vec3i, device="cpu")
+            self._bounds_view = self._bounds.numpy()
+
+    def _spread(self, count: int, launch: Callable[[int, int, int], None]) -> None:
+        """Call `launch(block, first, count)` for every block of `count` items, in parallel."""
+        if self._pool is None or self.blocks == 1:
+            launch(0, 0, count)
+            return
+        edges = [count * block // self.blocks for block in range(self.blocks + 1)]
+        futures = [
+            self._pool.submit(launch, block, edges[block], edges[block + 1] - edges[block]) for block in range(1, self.blocks)
+        ]
+        launch(0, 0, edges[1])
+        for future in futures:
+            future.result()
+
+    def _launch(self, kernel: Any, count: int, inputs: Sequence[Any]) -> None:
+        wp.launch(kernel, dim=(self.worlds, count), inputs=list(inputs), device=self.program.device)
+
+    def _grid_box(self, position: Any) -> tuple[Any, Any, int]:
+        """Origin, size and number of nodes of a grid that holds all stencils."""
+        n = self.program.parameters.grid_size
+        if not self._on_cpu:
+            return wp.vec3i(0, 0, 0), wp.vec3i(n, n, n), n**3
+        wp.launch(self.program.kernels.bounds, dim=1, inputs=[position, self.program.parameters, self._bounds], device="cpu")
+        low, high = self._bounds_view.tolist()
+        # not finite positions turn into wild node numbers: stay inside the domain, the values stay nan
+        low = [min(max(value, 0), n - 3) for value in low]
+        size = [min(max(top, base + 2), n - 1) - base + 1 for base, top in zip(low, high, strict=True)]
+        return wp.vec3i(*low), wp.vec3i(*size), size[0] * size[1] * size[2]
+
+    def _zeros(self, rows: int, nodes: int) -> Any:
+        return wp.zeros((rows, nodes), dtype=self.program.types.vec4, device=self.program.device)
+
+    def _empty(self, dtype: Any) -> Any:
+        return wp.empty((self.worlds, self.particle_count), dtype=dtype, device=self.program.device)
+
+    def forward(self, particles: Particles, poses: Any, frame: int) -> tuple[Substep, Particles]:
+        """One substep.
+
+        Args:
+            particles: Particles before it.
+            poses: Tool poses (W, frames, tools).
+            frame: Number of the substep; tools move from this frame to the next.
+
+        Returns:
+            The record for the adjoint, and the particles after the substep.
+        """
+        program, kernels, types = self.program, self.program.kernels, self.program.types
+        origin, size, nodes = self._grid_box(particles.position)
+        grid = self._zeros(self.blocks * self.worlds, nodes)
+        velocity = wp.empty((self.worlds, nodes), dtype=types.vec4, device=program.device)
+        after = Particles(self._empty(types.vec3), self._empty(types.vec3), self._empty(types.mat33), self._empty(types.vec6))
+
+        def scatter(block: int, first: int, count: int) -> None:
+            self._launch(kernels.particles_to_grid, count, [
+                particles.position, particles.velocity, particles.affine, particles.strain, program.constants,
+                program.parameters, first, block * self.worlds, origin, size, after.strain, grid])
+
+        def update(block: int, first: int, count: int) -> None:
+            self._launch(kernels.update_grid, count, [
+                grid, self.blocks, poses, program.tools, program.parameters, frame, first, origin, size, velocity])
+
+        def gather(block: int, first: int, count: int) -> None:
+            self._launch(kernels.grid_to_particles, count, [
+                particles.position, velocity, program.parameters, first, origin, size,
+                after.position, after.velocity, after.affine])
+
+        self._spread(self.particle_count, scatter)
+        self._spread(nodes, update)
+        self._spread(self.particle_count, gather)
+        return Substep(particles, grid, origin, size), after
+
+    def backward(
+        self, substep: Substep, velocity_after: Any, poses: Any, frame: int, gradient: Particles, grad_poses: Any
+    ) -> None:
+        """The adjoint of one substep, in place.
+
+        Args:
+            substep: Record of the substep.
+            velocity_after: Particle velocities (W, N) after it.
+            poses: Tool poses (W, frames, tools).
+            frame: Number of the substep.
+            gradient: Gradient with respect to the particles after the substep; becomes that before it.
+            grad_poses: Gradient (blocks * W, frames, tools) with respect to the poses; added to.
+        """
+        program, kernels = self.program, self.program.kernels
+        before, origin, size = substep.particles, substep.origin, substep.size
+        nodes = substep.grid.shape[1]
+        velocity = wp.empty((self.worlds, nodes), dtype=program.types.vec4, device=program.device)
+        grad_grid = self._zeros(self.blocks * self.worlds, nodes)
+
+        def update(block: int, first: int, count: int) -> None:
+            self._launch(kernels.update_grid, count, [
+                substep.grid, 1, poses, program.tools, program.parameters, frame, first, origin, size, velocity])
+
+        def scatter(block: int, first: int, count: int) -> None:
+            self._launch(kernels.grid_to_particles_adjoint, count, [
+                before.position, velocity_after, velocity, program.parameters, first, block * self.worlds, origin, size,
+                gradient.position, gradient.velocity, gradient.affine, grad_grid])
+
+        def update_adjoint(block: int, first: int, count: int) -> None:
+            self._launch(kernels.update_grid_adjoint, count, [
+                substep.grid, self.blocks, poses, program.tools, program.parameters, frame, first, origin, size,
+                grad_grid, block, grad_poses])
+
+        def gather(block: int, first: int, count: int) -> None:
+            self._launch(kernels.particles_to_grid_adjoint, count, [
+                before.position, before.velocity, before.affine, before.strain, program.constants, program.parameters,
+                first, origin, size, grad_grid, gradient.position, gradient.velocity, gradient.affine, gradient.strain])
+
+        self._spread(nodes, update)
+        self._spread(self.particle_count, scatter)
+        self._spread(nodes, update_adjoint)
+        self._spread(self.particle_count, gather)

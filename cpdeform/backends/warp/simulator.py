@@ -1,0 +1,331 @@
+"""The Warp backend's `Simulator`: tensors in, tensors out, lanes of worlds between."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+from typing import Any, ClassVar, TypeVar
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from cpdeform.backends.warp.kernels_grid import build_grid
+from cpdeform.backends.warp.kernels_motion import build_motion
+from cpdeform.backends.warp.kernels_transfer import build_transfer
+from cpdeform.backends.warp.kernels_types import KIND_NUMBERS, build_types
+from cpdeform.backends.warp.lane import Lane, Particles, Program, Substep
+from cpdeform.backends.warp.scene_arrays import make_constants, make_parameters, make_tools
+from cpdeform.core.errors import InputError
+from cpdeform.core.scene import Scene
+from cpdeform.core.simulator import RolloutGradient, Simulator, SimulatorCapabilities, Trajectory
+from cpdeform.core.state import State
+
+Result = TypeVar("Result")
+
+
+@dataclasses.dataclass(frozen=True)
+class _LaneCheckpoints:
+    """What one lane keeps of a rollout.
+
+    Attributes:
+        worlds: First world of the lane and the one after its last.
+        poses: Warp view (W, T * substeps + 1, M) of the tool poses.
+        starts: Particles at the start of each step.
+        substeps: Per step, its substeps' records; None where they are to be computed anew.
+    """
+
+    worlds: slice
+    poses: Any
+    starts: tuple[Particles, ...]
+    substeps: tuple[tuple[Substep, ...] | None, ...]
+    final: Particles
+
+
+class SimulatorWarp(Simulator):
+    """MLS-MPM with von Mises plasticity on NVIDIA Warp, with hand-written adjoints.
+
+    Args:
+        scene: What to simulate.
+        batch_size: The most worlds that one call may hold.
+        device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+        dtype: `torch.float32` (default) or `torch.float64`.
+        threads: Threads on the CPU; those the process may use where absent. Worlds are spread over them first, then the particles
+            of one world (whose sums then depend on the number of threads in the last digits).
+        memory_budget: Bytes that a rollout may keep for its way back. Where all substeps fit, none is computed twice; otherwise
+            one checkpoint per environment step is kept and the inside recomputed.
+
+    Raises:
+        CapabilityError: The device, type or a manipulator is not supported.
+        InputError: An option is out of range.
+    """
+
+    capabilities: ClassVar[SimulatorCapabilities] = SimulatorCapabilities(
+        differentiable=True,
+        devices=("cpu", "cuda"),
+        dtypes=(torch.float32, torch.float64),
+        manipulator_kinds=tuple(KIND_NUMBERS),
+        deterministic_devices=("cpu",),
+    )
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        batch_size: int = 1,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype | None = None,
+        threads: int | None = None,
+        memory_budget: int = 1 << 29,
+    ) -> None:
+        super().__init__(scene, batch_size=batch_size, device=device, dtype=dtype)
+        if threads is not None and threads < 1:
+            raise InputError("threads", came=str(threads), expected="at least 1")
+        if memory_budget < 0:
+            raise InputError("memory_budget", came=str(memory_budget), expected="a number of bytes, 0 or more")
+        self.threads = threads or _available_cores()
+        self.memory_budget = memory_budget
+        _initialize_warp()
+        self._real = wp.float64 if self.dtype is torch.float64 else wp.float32
+        self._types = build_types(self._real)
+        self._program = self._make_program()
+        self._pool = ThreadPoolExecutor(self.threads) if self.device.type == "cpu" and self.threads > 1 else None
+
+    def _make_program(self) -> Program:
+        device = "cpu" if self.device.type == "cpu" else f"cuda:{self.device.index or 0}"
+        kernels = SimpleNamespace(
+            **vars(build_transfer(self._real)), **vars(build_grid(self._real)), **vars(build_motion(self._real))
+        )
+        # compile now, in this thread: a launch that finds its kernel not yet compiled is not safe from several threads
+        for kernel in vars(kernels).values():
+            kernel.module.load(wp.get_device(device), block_dim=1 if device == "cpu" else 256)
+        return Program(
+            types=self._types,
+            kernels=kernels,
+            parameters=make_parameters(self.scene, self._real),
+            tools=make_tools(self.scene, self._real, device),
+            constants=make_constants(self.scene, self._real, device),
+            substeps=self.scene.substeps,
+            device=device,
+        )
+
+    @contextlib.contextmanager
+    def _stream(self) -> Iterator[None]:
+        """Order Warp's work with torch's on CUDA."""
+        if self.device.type == "cpu":
+            yield
+        else:
+            with torch.cuda.device(self.device), wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream())):
+                yield
+
+    def _lanes(self, worlds: int) -> list[tuple[Lane, slice]]:
+        count = self.scene.particle_count
+        if self.device.type != "cpu":
+            return [(Lane(self._program, worlds=worlds, particle_count=count), slice(0, worlds))]
+        pool, blocks = (self._pool, self.threads) if worlds < self.threads else (None, 1)
+        return [
+            (Lane(self._program, worlds=1, particle_count=count, pool=pool, blocks=blocks), slice(world, world + 1))
+            for world in range(worlds)
+        ]
+
+    def _over_lanes(self, lanes: list[Any], work: Callable[[Any], Result]) -> list[Result]:
+        """Do the work of all lanes, in parallel where each is one thread's."""
+        if self._pool is None or len(lanes) < self.threads:
+            return [work(lane) for lane in lanes]
+        return list(self._pool.map(work, lanes))
+
+    def _wrap(self, tensor: Tensor, dtype: Any) -> Any:
+        return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+    def _move_tools(self, state: State, actions: Tensor) -> Tensor:
+        """Tool poses (B, T * substeps + 1, max(M, 1), 8) in every frame."""
+        worlds, steps, tools = state.batch_size, actions.shape[1], state.manipulator_pose.shape[1]
+        frames = steps * self.scene.substeps + 1
+        poses = torch.zeros(worlds, frames, max(tools, 1), 8, dtype=self.dtype, device=self.device)
+        if tools:
+            poses[:, 0] = state.manipulator_pose
+            inputs = [
+                self._wrap(actions, self._real), self._program.tools, self.scene.substeps, self._wrap(poses, self._types.vec8)
+            ]
+            wp.launch(self._program.kernels.move_tools, dim=(worlds, tools), inputs=inputs, device=self._program.device)
+        return poses
+
+    def rollout(self, state: State, actions: Tensor) -> Trajectory:
+        """Simulate T environment steps; see `Simulator.rollout`."""
+        self.check_inputs(state, actions)
+        state = state.to(device=self.device, dtype=self.dtype).map(lambda tensor: tensor.detach().contiguous())
+        actions = actions.detach().to(device=self.device, dtype=self.dtype).contiguous()
+        worlds, steps, tools = state.batch_size, actions.shape[1], state.manipulator_pose.shape[1]
+        shape = (worlds, steps + 1, state.particle_count, 3)
+        positions = torch.empty(shape, dtype=self.dtype, device=self.device)
+        final = state.map(torch.empty_like)
+        keep = self._history_bytes(steps) * worlds <= self.memory_budget
+        with self._stream():
+            poses = self._move_tools(state, actions)
+            lanes = self._over_lanes(
+                self._lanes(worlds), lambda lane: self._rollout_lane(*lane, state, poses, positions, final, steps, keep)
+            )
+        frames = poses[:, :: self.scene.substeps, :tools]
+        final = dataclasses.replace(final, manipulator_pose=frames[:, -1].clone())
+        return Trajectory(
+            positions=positions,
+            manipulator_poses=frames.clone(),
+            actions=actions,
+            initial_state=state,
+            final_state=final,
+            checkpoints=tuple(lanes),
+        )
+
+    def _particles(self, state: State, worlds: slice) -> Particles:
+        types = self._types
+        return Particles(
+            self._wrap(state.position[worlds], types.vec3),
+            self._wrap(state.velocity[worlds], types.vec3),
+            self._wrap(state.affine[worlds], types.mat33),
+            self._wrap(state.elastic_strain[worlds], types.vec6),
+        )
+
+    def _rollout_lane(
+        self, lane: Lane, worlds: slice, state: State, poses: Tensor, positions: Tensor, final: State, steps: int, keep: bool
+    ) -> _LaneCheckpoints:
+        particles = self._particles(state, worlds)
+        view = self._wrap(poses[worlds], self._types.vec8)
+        positions[worlds, 0] = state.position[worlds]
+        starts, kept = [], []
+        for step in range(steps):
+            starts.append(particles)
+            records, particles = self._run_step(lane, particles, view, step, keep=keep)
+            kept.append(records)
+            positions[worlds, step + 1] = wp.to_torch(particles.position)
+        targets = (final.position, final.velocity, final.affine, final.elastic_strain)
+        sources = (particles.position, particles.velocity, particles.affine, particles.strain)
+        for target, source in zip(targets, sources, strict=True):
+            target[worlds] = wp.to_torch(source).reshape(target[worlds].shape)
+        return _LaneCheckpoints(worlds, view, tuple(starts), tuple(kept), particles)
+
+    def _run_step(
+        self, lane: Lane, particles: Particles, poses: Any, step: int, *, keep: bool
+    ) -> tuple[tuple[Substep, ...] | None, Particles]:
+        records = []
+        for frame in range(step * self.scene.substeps, (step + 1) * self.scene.substeps):
+            record, particles = lane.forward(particles, poses, frame)
+            if keep:
+                records.append(record)
+        return (tuple(records) if keep else None), particles
+
+    def vjp(
+        self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None
+    ) -> RolloutGradient:
+        """Pull gradients back through a rollout; see `Simulator.vjp`."""
+        if not isinstance(trajectory.checkpoints, tuple):
+            raise InputError("trajectory", came="a trajectory without checkpoints", expected="one made by this simulator's rollout")
+        if grad_positions.shape != trajectory.positions.shape:
+            raise InputError(
+                "grad_positions", came=f"shape {tuple(grad_positions.shape)}", expected=f"shape {tuple(trajectory.positions.shape)}"
+            )
+        state, actions = trajectory.initial_state, trajectory.actions
+        grad_positions = grad_positions.detach().to(device=self.device, dtype=self.dtype)
+        gradient = state.map(torch.zeros_like)
+        lanes = self._lanes(state.batch_size)
+        with self._stream():
+            parts = self._over_lanes(
+                list(zip(lanes, trajectory.checkpoints, strict=True)),
+                lambda pair: self._vjp_lane(pair[0][0], pair[1], grad_positions, gradient),
+            )
+            grad_poses = torch.cat(parts)
+            if grad_manipulators is not None:
+                tools = state.manipulator_pose.shape[1]
+                grad_poses[:, :: self.scene.substeps, :tools] += grad_manipulators.to(grad_poses)
+            grad_actions = self._pull_back_tools(trajectory, actions, grad_poses, gradient)
+        # the kernels hold the strain's gradient as a symmetric matrix; the state's off-diagonal numbers stand for two entries
+        gradient.elastic_strain[..., 3:] *= 2.0
+        return RolloutGradient(actions=grad_actions, initial_state=gradient)
+
+    def _vjp_lane(self, lane: Lane, kept: _LaneCheckpoints, grad_positions: Tensor, gradient: State) -> Tensor:
+        """Adjoint of one lane; writes its worlds of `gradient` and returns the gradient (W, frames, M, 8) of the poses."""
+        worlds, frames, tools = kept.poses.shape
+        rows = lane.blocks * worlds
+        grad_poses = torch.zeros(rows, frames, tools, 8, dtype=self.dtype, device=self.device)
+        view = self._wrap(grad_poses, self._types.vec8)
+        particles = self._particles(gradient, kept.worlds)
+        position = gradient.position[kept.worlds]
+        steps = len(kept.starts)
+        position += grad_positions[kept.worlds, steps]
+        after = kept.final.velocity
+        for step in reversed(range(steps)):
+            records = kept.substeps[step]
+            if records is None:
+                records, _ = self._run_step(lane, kept.starts[step], kept.poses, step, keep=True)
+            assert records is not None
+            for index in reversed(range(self.scene.substeps)):
+                lane.backward(records[index], after, kept.poses, step * self.scene.substeps + index, particles, view)
+                after = records[index].particles.velocity
+            position += grad_positions[kept.worlds, step]
+        return grad_poses.reshape(lane.blocks, worlds, frames, tools, 8).sum(dim=0)
+
+    def _pull_back_tools(self, trajectory: Trajectory, actions: Tensor, grad_poses: Tensor, gradient: State) -> Tensor:
+        """Gradient (B, T, A) of the actions; writes that of the start poses to `gradient`."""
+        grad_actions = torch.zeros_like(actions)
+        worlds, tools = gradient.manipulator_pose.shape[:2]
+        if not tools:
+            return grad_actions
+        types = self._types
+        poses = self._move_tools(trajectory.initial_state, actions)
+        inputs = [
+            self._wrap(actions, self._real), self._program.tools, self.scene.substeps, self._wrap(poses, types.vec8),
+            self._wrap(grad_poses, types.vec8), self._wrap(grad_actions, self._real),
+            self._wrap(gradient.manipulator_pose, types.vec8),
+        ]
+        wp.launch(self._program.kernels.move_tools_adjoint, dim=(worlds, tools), inputs=inputs, device=self._program.device)
+        return grad_actions
+
+    def _particle_bytes(self) -> int:
+        return (3 + 3 + 9 + 6) * self.dtype.itemsize
+
+    def _grid_bytes(self) -> int:
+        """Bytes of one substep's grid of one world: the full grid on CUDA, about the bodies' bounding boxes on the CPU."""
+        node = 4 * self.dtype.itemsize
+        if self.device.type != "cpu":
+            return node * self.scene.grid_size**3
+        lower = [min(body.position[axis] - body.half_extents[axis] for body in self.scene.bodies) for axis in range(3)]
+        upper = [max(body.position[axis] + body.half_extents[axis] for body in self.scene.bodies) for axis in range(3)]
+        nodes = 1.0
+        for low, high in zip(lower, upper, strict=True):
+            nodes *= (high - low) * self.scene.grid_size + 4
+        return int(node * nodes)
+
+    def _history_bytes(self, step_count: int) -> int:
+        """Bytes per world to keep every substep of a rollout."""
+        return step_count * self.scene.substeps * (self.scene.particle_count * self._particle_bytes() + self._grid_bytes())
+
+    def memory_estimate(self, step_count: int) -> int:
+        """Bytes that a rollout of `step_count` steps in `batch_size` worlds and its `vjp` hold at their peak."""
+        count = self.scene.particle_count
+        particles = count * self._particle_bytes()
+        snapshots = (step_count + 1) * count * 3 * self.dtype.itemsize
+        whole = self._history_bytes(step_count)
+        if whole * self.batch_size <= self.memory_budget:
+            history = whole
+        else:
+            history = step_count * particles + self._history_bytes(1)
+        # state, its gradient, the caller's gradient of the snapshots
+        return self.batch_size * (history + 2 * snapshots + 4 * particles)
+
+
+def _available_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _initialize_warp() -> None:
+    """Start Warp without its banner."""
+    level = wp.config.log_level
+    wp.config.log_level = wp.LOG_ERROR
+    wp.init()
+    wp.config.log_level = level

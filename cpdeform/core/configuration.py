@@ -1,0 +1,69 @@
+"""The configuration of a run: what the command line sets and the run record keeps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field
+
+from cpdeform.core.scene import FrozenModel
+
+
+class OptimizerConfiguration(FrozenModel):
+    """Options of `cpdeform.core.optimizer.TrajectoryOptimizer`; see there."""
+
+    iterations: int = Field(default=40, ge=1)
+    learning_rate: float = Field(default=0.1, gt=0.0)
+    patience: int = Field(default=15, ge=1)
+    tolerance: float = Field(default=1e-3, ge=0.0)
+    initial_noise: float = Field(default=0.01, ge=0.0)
+
+
+class ObjectiveConfiguration(FrozenModel):
+    """What a plan's loss is.
+
+    Attributes:
+        points: Particles that the transport loss is computed on, a fixed random subset; None for all.
+        blur: Entropic blur of the transport loss, length units.
+        refresh: Solve from scratch every so many evaluations, warm-started between.
+        contact_weight: Weight of PlasticineLab's contact term, which draws tools to the body.
+    """
+
+    points: int | None = Field(default=2000, ge=1)
+    blur: float = Field(default=2e-3, gt=0.0)
+    refresh: int = Field(default=20, ge=1)
+    contact_weight: float = Field(default=0.0, ge=0.0)
+
+
+class RunConfiguration(FrozenModel):
+    """Everything that defines a run, under the names of the command line and of `--set`.
+
+    Attributes:
+        task: Registered name or path of a YAML file.
+        backend: Registered name of the simulator.
+        ot: Registered name of the transport solver.
+        placer: Registered name of the placer.
+        device: Where tensors live, ``"cpu"`` or ``"cuda"``.
+        seed: Seed of first actions and random placements.
+        stages: Number of stages; the task's own where absent.
+        optimizer: Options of the optimiser.
+        objective: Options of the loss.
+        scene: Changes of the task's scene, e.g. ``{"ground_friction": 2.0, "bodies": {"0": {"particle_count": 3000}}}``.
+        simulator_options: Further keyword options of the simulator.
+        ot_options: Keyword options of the transport solver that gives the priorities.
+        placer_options: Keyword options of the placer.
+    """
+
+    task: str = "writer"
+    backend: str = "warp"
+    ot: str = "geomloss"
+    placer: str = "transport"
+    device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?)$")
+    seed: int = Field(default=0, ge=0)
+    stages: int | None = Field(default=None, ge=1)
+    optimizer: OptimizerConfiguration = OptimizerConfiguration()
+    objective: ObjectiveConfiguration = ObjectiveConfiguration()
+    scene: dict[str, Any] = Field(default_factory=dict)
+    simulator_options: dict[str, Any] = Field(default_factory=dict)
+    ot_options: dict[str, Any] = Field(default_factory=dict)
+    placer_options: dict[str, Any] = Field(default_factory=dict)

@@ -1,0 +1,197 @@
+"""`deform`: one call from a task to a plan, parts given by name or as objects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from cpdeform.core.algorithm import Planner
+from cpdeform.core.configuration import ObjectiveConfiguration, RunConfiguration
+from cpdeform.core.errors import InputError
+from cpdeform.core.hook_observer import HookObserver
+from cpdeform.core.objective import Objective
+from cpdeform.core.objectives.transport import ObjectiveTransport
+from cpdeform.core.optimizer import TrajectoryOptimizer
+from cpdeform.core.ot import OTSolver
+from cpdeform.core.placer import Placer
+from cpdeform.core.plugins import Registry, load_registry
+from cpdeform.core.result import DeformResult, Observer
+from cpdeform.core.simulator import Simulator
+from cpdeform.core.state import State
+from cpdeform.core.task import Task, load_task, merge, validate
+
+MAX_WORLDS = 8
+"""Candidates that are solved as one batch; more are solved in several."""
+
+
+def deform(
+    task: Task | str = "writer",
+    *,
+    simulator: Simulator | str = "warp",
+    ot_solver: OTSolver | str = "geomloss",
+    placer: Placer | str = "transport",
+    objective: Objective | None = None,
+    optimizer: TrajectoryOptimizer | None = None,
+    device: str = "cpu",
+    seed: int = 0,
+    stages: int | None = None,
+    state: State | None = None,
+    observers: Sequence[Observer] = (),
+    registry: Registry | None = None,
+) -> DeformResult:
+    """Plan how the tools of a task turn its body into its goal (paper, Algorithm 1).
+
+    Args:
+        task: A task, a registered name, or the path of a YAML file.
+        simulator: A simulator of the task's scene, or a registered name.
+        ot_solver: A transport solver or a registered name; it gives the priorities and, unless `objective` is given, the loss.
+        placer: A placer or a registered name.
+        objective: The loss; Wasserstein distance of the last step's particles to the goal where absent.
+        optimizer: Finds actions; defaults to `TrajectoryOptimizer()`.
+        device: Where a simulator given by name runs, ``"cpu"`` or ``"cuda"``.
+        seed: Seed of first actions and random placements.
+        stages: Number of stages; the task's own where absent.
+        state: Where to start, a single world, e.g. the last state of a run record; the scene's start where absent.
+        observers: Told of every iteration and stage, in order; the plugins' observers come after them.
+        registry: Where names are looked up; the installed plugins where absent.
+
+    Returns:
+        Stages, losses, metric and status; `DeformResult.save` writes the run record.
+
+    Raises:
+        InputError: A name, an option or the task cannot be used.
+        CapabilityError: The parts do not fit together.
+    """
+    registry = registry or load_registry()
+    task = load_task(task, registry=registry) if isinstance(task, str) else task
+    for kind, part in (("simulator", simulator), ("ot_solver", ot_solver), ("placer", placer)):
+        if isinstance(part, str):
+            registry.find(kind, part)
+    names = {
+        kind: part if isinstance(part, str) else type(part).__name__
+        for kind, part in (("backend", simulator), ("ot", ot_solver), ("placer", placer))
+    }
+    used_placer: Placer = registry.create("placer", placer) if isinstance(placer, str) else placer
+    used_simulator: Simulator = (
+        registry.create("simulator", simulator, scene=task.scene, batch_size=MAX_WORLDS, device=device)
+        if isinstance(simulator, str)
+        else simulator
+    )
+    if objective is None:
+        objective = transport_objective(task, ot_solver, used_simulator, registry=registry)
+    used_solver: OTSolver = registry.create("ot_solver", ot_solver) if isinstance(ot_solver, str) else ot_solver
+    planner = Planner(
+        task=task,
+        simulator=used_simulator,
+        ot_solver=used_solver,
+        placer=used_placer,
+        objective=objective,
+        optimizer=optimizer or TrajectoryOptimizer(),
+        seed=seed,
+        observers=(*observers, HookObserver(registry.manager)),
+        names=names,
+    )
+    return planner.run(stages=stages, state=state)
+
+
+def deform_configuration(
+    configuration: RunConfiguration,
+    *,
+    observers: Sequence[Observer] = (),
+    registry: Registry | None = None,
+) -> DeformResult:
+    """Run what a configuration describes; the command line's way to `deform`.
+
+    Args:
+        configuration: Names and options of all parts.
+        observers: Told of every iteration and stage, in order; the plugins' observers come after them.
+        registry: Where names are looked up; the installed plugins where absent.
+
+    Returns:
+        As `deform`.
+
+    Raises:
+        InputError: A name, an option or the task cannot be used.
+        CapabilityError: The parts do not fit together.
+    """
+    registry = registry or load_registry()
+    check_names(configuration, registry=registry)
+    task = configured_task(configuration, registry=registry)
+    placer = registry.create("placer", configuration.placer, **configuration.placer_options)
+    simulator_options = {"batch_size": MAX_WORLDS, **configuration.simulator_options}
+    simulator = registry.create(
+        "simulator", configuration.backend, scene=task.scene, device=configuration.device, **simulator_options
+    )
+    ot_solver = registry.create("ot_solver", configuration.ot, **configuration.ot_options)
+    objective = transport_objective(task, configuration.ot, simulator, options=configuration.objective, registry=registry)
+    planner = Planner(
+        task=task,
+        simulator=simulator,
+        ot_solver=ot_solver,
+        placer=placer,
+        objective=objective,
+        optimizer=TrajectoryOptimizer(**configuration.optimizer.model_dump()),
+        seed=configuration.seed,
+        observers=(*observers, HookObserver(registry.manager)),
+        names={"backend": configuration.backend, "ot": configuration.ot, "placer": configuration.placer},
+    )
+    return planner.run(stages=configuration.stages)
+
+
+def check_names(configuration: RunConfiguration, *, registry: Registry) -> None:
+    """Hold the names and option groups of a configuration against the registry, before anything slow is imported.
+
+    Raises:
+        UnknownNameError: No plugin registers one of the names.
+        InputError: An option of the simulator belongs elsewhere.
+    """
+    for kind, name in (("simulator", configuration.backend), ("ot_solver", configuration.ot), ("placer", configuration.placer)):
+        registry.find(kind, name)
+    for option, place in (("scene", "scene.<field>"), ("device", "device")):
+        if option in configuration.simulator_options:
+            remedy = f"Set {place} instead."
+            raise InputError("simulator_options", came=f'"{option}"', expected="other options", remedy=remedy)
+
+
+def configured_task(configuration: RunConfiguration, *, registry: Registry) -> Task:
+    """Load a configuration's task and apply its changes of the scene.
+
+    Raises:
+        InputError: The task or a change cannot be used.
+    """
+    task = load_task(configuration.task, registry=registry)
+    if not configuration.scene:
+        return task
+    changed = merge(task.model_dump(), {"scene": configuration.scene})
+    return validate(Task, changed, source=f"task {task.name} with --set")
+
+
+def transport_objective(
+    task: Task,
+    ot_solver: OTSolver | str,
+    simulator: Simulator,
+    *,
+    registry: Registry,
+    options: ObjectiveConfiguration | None = None,
+) -> ObjectiveTransport:
+    """The default loss: transport cost from the last step's particles to the goal.
+
+    Args:
+        task: Its target is the goal.
+        ot_solver: A solver used as it is, or a registered name, created with the blur of `options`.
+        simulator: Gives device and type.
+        registry: Where the name is looked up.
+        options: Subset size, blur, refresh schedule, contact weight.
+    """
+    options = options or ObjectiveConfiguration()
+    solver: OTSolver = registry.create("ot_solver", ot_solver, blur=options.blur) if isinstance(ot_solver, str) else ot_solver
+    target = torch.as_tensor(task.load_target()).to(device=simulator.device, dtype=simulator.dtype)
+    return ObjectiveTransport(
+        solver,
+        target,
+        scene=task.scene,
+        points=options.points,
+        refresh=options.refresh,
+        contact_weight=options.contact_weight,
+    )

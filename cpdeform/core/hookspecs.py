@@ -1,0 +1,61 @@
+"""The hooks of the entry-point group `cpdeform`: what a plugin can register and observe."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import pluggy
+
+if TYPE_CHECKING:
+    from cpdeform.core.result import DeformResult, StageResult
+
+hookspec = pluggy.HookspecMarker("cpdeform")
+hookimpl = pluggy.HookimplMarker("cpdeform")
+
+
+@dataclasses.dataclass(frozen=True)
+class PluginSpec:
+    """A part that a plugin offers, described without importing it.
+
+    Attributes:
+        name: The name that users type, lower case, e.g. ``"warp"``.
+        target: ``"module:attribute"`` of the class (of the YAML file for a task: ``"module:file.yaml"``), imported on use.
+        summary: One line for listings.
+        extra: What to install when the target's imports are missing, e.g. ``"cpdeform[warp]"``.
+    """
+
+    name: str
+    target: str
+    summary: str
+    extra: str = ""
+
+
+@hookspec
+def cpdeform_simulators() -> list[PluginSpec]:  # type: ignore[empty-body]
+    """Register subclasses of `cpdeform.core.simulator.Simulator`."""
+
+
+@hookspec
+def cpdeform_ot_solvers() -> list[PluginSpec]:  # type: ignore[empty-body]
+    """Register subclasses of `cpdeform.core.ot.OTSolver`."""
+
+
+@hookspec
+def cpdeform_placers() -> list[PluginSpec]:  # type: ignore[empty-body]
+    """Register subclasses of `cpdeform.core.placer.Placer`."""
+
+
+@hookspec
+def cpdeform_tasks() -> list[PluginSpec]:  # type: ignore[empty-body]
+    """Register task files."""
+
+
+@hookspec
+def cpdeform_stage_finished(result: StageResult) -> None:
+    """Observe a finished stage."""
+
+
+@hookspec
+def cpdeform_run_finished(result: DeformResult) -> None:
+    """Observe a finished run."""

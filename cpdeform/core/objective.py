@@ -1,0 +1,55 @@
+"""The objective interface: a scalar per world of a trajectory, and its gradient."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from cpdeform.core.simulator import Trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectiveResult:
+    """Loss and gradient of a batch of trajectories.
+
+    Attributes:
+        loss: Loss (B,) of each world.
+        grad_positions: Gradient (B, T+1, N, 3) of the sum of the losses with respect to `Trajectory.positions`.
+        grad_manipulators: Gradient (B, T+1, M, 8) with respect to `Trajectory.manipulator_poses`; None for zero.
+    """
+
+    loss: Tensor
+    grad_positions: Tensor
+    grad_manipulators: Tensor | None = None
+
+
+class Objective(abc.ABC):
+    """A loss on trajectories; each world is independent of the others."""
+
+    @abc.abstractmethod
+    def evaluate(self, trajectory: Trajectory) -> ObjectiveResult:
+        """Loss and gradient of each world of a trajectory."""
+
+    def reset(self) -> None:  # noqa: B027 - most objectives keep nothing
+        """Forget what was kept between calls (warm starts); called when a stage begins."""
+
+
+class ObjectiveAutograd(Objective):
+    """An objective written as a differentiable torch function; its gradient comes from autograd."""
+
+    @abc.abstractmethod
+    def loss(self, positions: Tensor, manipulator_poses: Tensor) -> Tensor:
+        """Loss (B,) of positions (B, T+1, N, 3), length units, and tool poses (B, T+1, M, 8)."""
+
+    def evaluate(self, trajectory: Trajectory) -> ObjectiveResult:
+        """Loss and gradient by automatic differentiation of `loss`."""
+        positions = trajectory.positions.detach().requires_grad_()
+        poses = trajectory.manipulator_poses.detach().requires_grad_()
+        with torch.enable_grad():
+            loss = self.loss(positions, poses)
+            gradients = torch.autograd.grad(loss.sum(), [positions, poses], allow_unused=True)
+        grad_positions = gradients[0] if gradients[0] is not None else torch.zeros_like(positions)
+        return ObjectiveResult(loss=loss.detach(), grad_positions=grad_positions, grad_manipulators=gradients[1])

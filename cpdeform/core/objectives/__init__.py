@@ -1,0 +1,1 @@
+"""Losses on trajectories and the metrics that results are reported in."""

@@ -1,0 +1,68 @@
+"""PlasticineLab's contact term: how far each movable tool is from the body."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from cpdeform.core.errors import InputError
+from cpdeform.core.scene import Manipulator, Scene
+from cpdeform.core.signed_distance import signed_distance
+
+ContactKind = Literal["hard", "soft"]
+
+SOFT_WEIGHT_DECAY = 1e4
+"""Decay of a particle's weight 1/(1 + decay d^2) in the soft contact term, 1/length^2."""
+
+
+def check_contact_kind(kind: str) -> None:
+    """Raise `InputError` unless `kind` is ``"hard"`` or ``"soft"``."""
+    if kind not in get_args(ContactKind):
+        raise InputError("contact", came=f'"{kind}"', expected="one of " + ", ".join(get_args(ContactKind)))
+
+
+def contact_loss(scene: Scene, positions: Tensor, manipulator_poses: Tensor, *, kind: ContactKind = "hard") -> Tensor:
+    """Squared distance between the body and each movable tool, summed over the tools.
+
+    With d_i = max(signed distance of particle i, 0), a tool contributes (min_i d_i)^2 (``"hard"``) or
+    (sum_i w_i d_i / sum_i w_i)^2 with w_i = 1/(1 + 10^4 d_i^2) (``"soft"``).
+
+    Args:
+        scene: Whose tools `manipulator_poses` are.
+        positions: Particle positions (..., N, 3), length units.
+        manipulator_poses: Tool poses (..., M, 8) at the same times; see `State.manipulator_pose`.
+        kind: ``"hard"`` or ``"soft"``.
+
+    Returns:
+        Contact loss (...), length units squared; zero in a scene without movable tools.
+
+    Raises:
+        InputError: `kind` is unknown.
+
+    References:
+        Huang et al., "PlasticineLab: A Soft-Body Manipulation Benchmark with Differentiable Physics", ICLR 2021.
+    """
+    check_contact_kind(kind)
+    total = positions.new_zeros(positions.shape[:-2])
+    for index, manipulator in enumerate(scene.manipulators):
+        if manipulator.movable:
+            distance = _hard_distance if kind == "hard" else _soft_distance
+            total = total + torch.square(distance(manipulator, manipulator_poses[..., index, :], positions))
+    return total
+
+
+def _hard_distance(manipulator: Manipulator, pose: Tensor, positions: Tensor) -> Tensor:
+    """Distance (...) to the nearest particle; only that one has to be part of the autograd graph."""
+    with torch.no_grad():
+        index = signed_distance(manipulator, pose, positions).argmin(dim=-1)
+    nearest = positions.gather(-2, index[..., None, None].expand(*index.shape, 1, 3))
+    return signed_distance(manipulator, pose, nearest).squeeze(-1).clamp(min=0.0)
+
+
+def _soft_distance(manipulator: Manipulator, pose: Tensor, positions: Tensor) -> Tensor:
+    """Mean (...) of the particles' distances, weighted towards the near ones."""
+    gap = signed_distance(manipulator, pose, positions).clamp(min=0.0)
+    weight = 1.0 / (1.0 + SOFT_WEIGHT_DECAY * gap * gap)
+    return (weight * gap).sum(dim=-1) / weight.sum(dim=-1)

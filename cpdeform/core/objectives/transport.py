@@ -1,0 +1,134 @@
+"""The paper's objective: transport cost between the final particles and the goal."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cpdeform.core.errors import InputError
+from cpdeform.core.objective import Objective, ObjectiveResult
+from cpdeform.core.objectives.contact import contact_loss
+from cpdeform.core.ot import OTResult, OTSolver
+from cpdeform.core.scene import Scene
+from cpdeform.core.simulator import Trajectory
+
+
+class ObjectiveTransport(Objective):
+    """Transport cost of each world's final particles against the goal, optionally with PlasticineLab's contact term.
+
+    The gradient is the solver's own, placed at the last step. Within a stage every world starts from its previous
+    solution where the solver declares `warm_start`: particles move little between iterations of an optimiser.
+
+    Args:
+        solver: Solves the transport problems.
+        target: Goal particles (M, 3), length units.
+        points: Solve on a fixed random subset of this many source and target particles; all of them where absent. A cloud
+            of fewer particles is used whole. Clouds of equal size share the subset, so that particles that correspond stay
+            together.
+        seed: Seed of the subset.
+        warm_start: Whether to start from the previous call's solution.
+        refresh: Solve from scratch on each `refresh`-th call, since errors of warm starts accumulate; never where absent.
+        contact_weight: Weight of the hard contact term, summed over the steps t = 1..T, cost units/length^2. It attracts
+            tools that do not touch the body yet, from which the transport cost alone has no gradient.
+        scene: Whose tools the contact term is about; required with a `contact_weight`.
+
+    Raises:
+        InputError: The target is not (M, 3), or an option is out of range.
+
+    References:
+        Li et al., "Contact Points Discovery for Soft-Body Manipulations with Differentiable Physics", ICLR 2022.
+    """
+
+    def __init__(
+        self,
+        solver: OTSolver,
+        target: Tensor,
+        *,
+        points: int | None = None,
+        seed: int = 0,
+        warm_start: bool = True,
+        refresh: int | None = None,
+        contact_weight: float = 0.0,
+        scene: Scene | None = None,
+    ) -> None:
+        if target.ndim != 2 or target.shape[1] != 3 or target.shape[0] == 0:
+            raise InputError("target", came=f"shape {tuple(target.shape)}", expected="shape (points, 3) with at least one point")
+        for name, number in (("points", points), ("refresh", refresh)):
+            if number is not None and number < 1:
+                raise InputError(name, came=str(number), expected="at least 1, or None")
+        if not 0.0 <= contact_weight < float("inf"):
+            raise InputError("contact_weight", came=str(contact_weight), expected="a finite number of at least 0")
+        if contact_weight > 0.0 and scene is None:
+            raise InputError("scene", came="None", expected="the scene", remedy="The contact term needs the shapes of its tools.")
+        self.solver, self.target, self.points, self.seed = solver, target.detach(), points, seed
+        self.warm_start, self.refresh = warm_start and solver.capabilities.warm_start, refresh
+        self.contact_weight, self.scene = contact_weight, scene
+        self._previous: list[OTResult] = []
+        self._calls = 0
+
+    def reset(self) -> None:
+        """Forget the solutions kept for warm starts."""
+        self._previous = []
+        self._calls = 0
+
+    def evaluate(self, trajectory: Trajectory) -> ObjectiveResult:
+        """Loss and gradient of each world of a trajectory.
+
+        Raises:
+            InputError: A final position is not finite.
+        """
+        positions = trajectory.positions.detach()
+        loss, gradient = self._transport(positions[:, -1])
+        grad_positions = torch.zeros_like(positions)
+        grad_positions[:, -1] = gradient
+        grad_poses = None
+        if self.contact_weight > 0.0 and self.scene is not None:
+            contact, contact_positions, grad_poses = self._contact(self.scene, positions, trajectory.manipulator_poses.detach())
+            loss = loss + contact
+            grad_positions += contact_positions
+        return ObjectiveResult(loss=loss, grad_positions=grad_positions, grad_manipulators=grad_poses)
+
+    def _transport(self, final: Tensor) -> tuple[Tensor, Tensor]:
+        """Cost (B,) and gradient (B, N, 3) of final positions (B, N, 3)."""
+        source_index, target_index = self._subsets(final.shape[1])
+        target = self.target.to(final)[target_index.to(final.device)]
+        source_index = source_index.to(final.device)
+        cold = self.refresh is not None and self._calls % self.refresh == 0
+        previous: list[OTResult | None] = [None] * final.shape[0]
+        # A call with another number of worlds is another batch of plans: which world was which is unknown.
+        if self.warm_start and not cold and len(self._previous) == final.shape[0]:
+            previous = list(self._previous)
+        results = [
+            self.solver.solve(cloud[source_index], target, previous=start) for cloud, start in zip(final, previous, strict=True)
+        ]
+        self._previous = results if self.warm_start else []
+        self._calls += 1
+        gradient = torch.zeros_like(final)
+        for world, result in enumerate(results):
+            gradient[world, source_index] = result.source_gradient.to(final)
+        return torch.stack([result.value.to(final) for result in results]), gradient
+
+    def _subsets(self, source_count: int) -> tuple[Tensor, Tensor]:
+        """Sorted indices of the source and the target particles that the problem is solved on."""
+        target_count = self.target.shape[0]
+        source_index = self._subset(source_count, self.seed)
+        if target_count == source_count:
+            return source_index, source_index
+        return source_index, self._subset(target_count, self.seed + 1)
+
+    def _subset(self, count: int, seed: int) -> Tensor:
+        if self.points is None or self.points >= count:
+            return torch.arange(count)
+        generator = torch.Generator().manual_seed(seed)
+        return torch.randperm(count, generator=generator)[: self.points].sort().values
+
+    def _contact(self, scene: Scene, positions: Tensor, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Weighted contact term (B,) and its gradient with respect to positions and tool poses."""
+        positions, poses = positions.requires_grad_(), poses.requires_grad_()
+        with torch.enable_grad():
+            terms = contact_loss(scene, positions[:, 1:], poses[:, 1:], kind="hard").sum(dim=1)
+            loss = self.contact_weight * terms
+            if not loss.requires_grad:
+                return loss, torch.zeros_like(positions), torch.zeros_like(poses)
+            grad_positions, grad_poses = torch.autograd.grad(loss.sum(), [positions, poses])
+        return loss.detach(), grad_positions, grad_poses

@@ -1,0 +1,150 @@
+"""The optimal-transport interface: one contract for all solvers."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from cpdeform.core.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class OTCapabilities:
+    """What a solver declares about its results.
+
+    Attributes:
+        potentials: ``"entropic"`` where they are unique up to the gauge, ``"exact"`` for a vertex of the exact dual. Only
+            entropic potentials are transport priorities: where source and target coincide the exact dual is free within the
+            Lipschitz bound, and its maximum may lie anywhere.
+        debiased: Whether value, potentials and gradient are those of the debiased Sinkhorn divergence [1]_.
+        warm_start: Whether `OTSolver.solve` makes use of `previous`.
+        devices: Device types that the solver computes on.
+        potential_tolerance: Largest difference, as a fraction of the potentials' range (max - min), from the potentials of
+            the converged entropic problem of the same blur.
+
+    References:
+        .. [1] Feydy et al., "Interpolating between Optimal Transport and MMD using Sinkhorn Divergences", AISTATS 2019.
+    """
+
+    potentials: Literal["entropic", "exact"]
+    debiased: bool
+    warm_start: bool
+    devices: tuple[str, ...]
+    potential_tolerance: float
+
+
+@dataclasses.dataclass(frozen=True)
+class OTResult:
+    """A solved transport problem between N source and M target points, cost |x - y|^p.
+
+    Attributes:
+        value: Transport cost (scalar tensor), in units of length^p.
+        source_potential: Dual potential f (N,) in cost units, gauge: its weighted median is zero. Where the shapes agree it is
+            zero; the larger it is, the farther that point has to move. The paper's transport priority.
+        target_potential: Dual potential g (M,) in cost units, shifted by the same constant the other way, so that
+            sum(a f) + sum(b g) equals `value`.
+        source_gradient: Gradient (N, 3) of `value` with respect to the source positions.
+        converged: Whether the solver's own stopping criterion was met within its iteration limit.
+        iterations: Iterations used.
+        marginal_error: Violation of the source marginal in the L1 norm, dimensionless; nan where the solver does not know.
+        blur: Entropic blur, length units (0 for an exact solution).
+        warm_state: What `solve(previous=...)` uses beyond the fields above; opaque, owned by the solver.
+    """
+
+    value: Tensor
+    source_potential: Tensor
+    target_potential: Tensor
+    source_gradient: Tensor
+    converged: bool
+    iterations: int
+    marginal_error: float
+    blur: float
+    warm_state: object = None
+
+
+class OTSolver(abc.ABC):
+    """Solves optimal transport between two weighted particle clouds."""
+
+    capabilities: ClassVar[OTCapabilities]
+
+    @abc.abstractmethod
+    def solve(
+        self,
+        source: Tensor,
+        target: Tensor,
+        *,
+        source_weights: Tensor | None = None,
+        target_weights: Tensor | None = None,
+        previous: OTResult | None = None,
+    ) -> OTResult:
+        """Solve one problem.
+
+        Args:
+            source: Source positions (N, 3), length units.
+            target: Target positions (M, 3), length units, same device and type.
+            source_weights: Non-negative weights (N,) summing to 1; uniform where absent.
+            target_weights: Non-negative weights (M,) summing to 1; uniform where absent.
+            previous: Result of a nearby problem of the same sizes, to start from.
+
+        Returns:
+            Value, potentials and gradient, detached, on the device and in the type of `source`.
+
+        Raises:
+            InputError: Shapes, devices or weights do not fit, or a number is not finite.
+        """
+
+
+def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
+    """Lower weighted median (scalar tensor) of `values` (N,) under non-negative `weights` (N,)."""
+    order = torch.argsort(values)
+    cumulative = torch.cumsum(weights[order], dim=0)
+    index = torch.searchsorted(cumulative, 0.5 * cumulative[-1]).clamp(max=values.numel() - 1)
+    return values[order][index]
+
+
+def fix_gauge(source_potential: Tensor, target_potential: Tensor, source_weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Shift potentials (N,), (M,) to the one gauge: the weighted median of the source potential is zero."""
+    shift = weighted_median(source_potential, source_weights)
+    return source_potential - shift, target_potential + shift
+
+
+def check_problem(
+    source: Tensor, target: Tensor, source_weights: Tensor | None, target_weights: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Validate the arguments of `OTSolver.solve` and fill in uniform weights.
+
+    Returns:
+        Source weights (N,) and target weights (M,), each summing to 1.
+
+    Raises:
+        InputError: Shapes, devices, types or weights do not fit, or a number is not finite.
+    """
+    for name, points in (("source", source), ("target", target)):
+        if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] == 0:
+            raise InputError(name, came=f"shape {tuple(points.shape)}", expected="shape (points, 3) with at least one point")
+        if not bool(torch.isfinite(points).all()):
+            bad = int((~torch.isfinite(points)).any(dim=1).sum())
+            raise InputError(name, came=f"{bad} points with nan or infinity", expected="finite positions")
+    if source.device != target.device or source.dtype != target.dtype:
+        raise InputError(
+            "target", came=f"{target.dtype} on {target.device}", expected=f"{source.dtype} on {source.device}, as the source"
+        )
+    return _check_weights("source_weights", source_weights, source), _check_weights("target_weights", target_weights, target)
+
+
+def _check_weights(name: str, weights: Tensor | None, points: Tensor) -> Tensor:
+    count = points.shape[0]
+    if weights is None:
+        return torch.full((count,), 1.0 / count, dtype=points.dtype, device=points.device)
+    if weights.shape != (count,):
+        raise InputError(name, came=f"shape {tuple(weights.shape)}", expected=f"shape ({count},)")
+    if not bool(torch.isfinite(weights).all()) or bool((weights < 0).any()):
+        raise InputError(name, came="negative or non-finite entries", expected="non-negative finite weights")
+    total = float(weights.sum())
+    if abs(total - 1.0) > 1e-3:
+        raise InputError(name, came=f"a sum of {total:.6g}", expected="a sum of 1", remedy="Divide the weights by their sum.")
+    return weights.to(points)

@@ -1,0 +1,263 @@
+"""Discovery of plugins through the entry-point group `cpdeform`, and lazy loading of what they register."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.metadata
+import inspect
+import re
+import traceback
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import pluggy
+
+from cpdeform.core import hookspecs
+from cpdeform.core.errors import CpdeformError, InputError, MissingExtraError, PluginError, UnknownNameError
+from cpdeform.core.hookspecs import PluginSpec
+
+GROUP = "cpdeform"
+KINDS: Mapping[str, str] = {
+    "simulator": "cpdeform_simulators",
+    "ot_solver": "cpdeform_ot_solvers",
+    "placer": "cpdeform_placers",
+    "task": "cpdeform_tasks",
+}
+"""What can be registered, and the hook that registers it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Registration:
+    """A registered part and where it comes from.
+
+    Attributes:
+        kind: One of `KINDS`.
+        spec: What the plugin says about it.
+        distribution: Name and version of the installed distribution.
+        entry_point: Name of the entry point.
+    """
+
+    kind: str
+    spec: PluginSpec
+    distribution: str
+    entry_point: str
+
+
+@dataclasses.dataclass(frozen=True)
+class PluginFailure:
+    """A plugin that could not be loaded; reported, never fatal.
+
+    Attributes:
+        entry_point: Name of the entry point.
+        distribution: Name and version of the installed distribution.
+        reason: The error, in one line.
+        details: The traceback.
+    """
+
+    entry_point: str
+    distribution: str
+    reason: str
+    details: str
+
+
+class Registry:
+    """All parts that the installed plugins register; made anew by `load_registry`, never shared.
+
+    Attributes:
+        manager: The pluggy manager that holds the loaded plugins.
+        failures: Plugins that could not be loaded.
+    """
+
+    def __init__(
+        self, manager: pluggy.PluginManager, registrations: Iterable[Registration], failures: Iterable[PluginFailure]
+    ) -> None:
+        self.manager = manager
+        self.failures = tuple(failures)
+        self._parts: dict[tuple[str, str], Registration] = {}
+        for registration in registrations:
+            key = (registration.kind, registration.spec.name)
+            if key in self._parts:
+                first = self._parts[key]
+                raise PluginError(
+                    f'{registration.kind} "{registration.spec.name}" is registered twice: by {first.distribution} '
+                    f"({first.spec.target}) and by {registration.distribution} ({registration.spec.target}). Uninstall one of them."
+                )
+            self._parts[key] = registration
+
+    def registrations(self, kind: str | None = None) -> list[Registration]:
+        """Registered parts of one kind, or of all, sorted by kind and name."""
+        return [self._parts[key] for key in sorted(self._parts) if kind is None or key[0] == kind]
+
+    def names(self, kind: str) -> list[str]:
+        """Names registered for a kind."""
+        return [registration.spec.name for registration in self.registrations(kind)]
+
+    def find(self, kind: str, name: str) -> Registration:
+        """Look a part up by name.
+
+        Raises:
+            UnknownNameError: No plugin registers the name; the message holds the nearest one.
+        """
+        registration = self._parts.get((kind, name))
+        if registration is None:
+            remedy = "Run `cpdeform plugins` to see what is installed."
+            if self.failures:
+                remedy += " Plugins that failed to load: " + ", ".join(failure.entry_point for failure in self.failures) + "."
+            raise UnknownNameError(kind, name, self.names(kind), remedy=remedy)
+        return registration
+
+    def load(self, kind: str, name: str) -> Any:
+        """Import and return the object that a name stands for.
+
+        Raises:
+            UnknownNameError: No plugin registers the name.
+            MissingExtraError: An optional dependency is not installed; the message holds the command that installs it.
+            PluginError: The target does not exist, or its import fails.
+        """
+        spec = self.find(kind, name).spec
+        module_name, _, attribute = spec.target.partition(":")
+        try:
+            module = importlib.import_module(module_name)
+        except CpdeformError:
+            raise
+        except Exception as error:
+            raise _import_error(kind, spec, error) from error
+        if not hasattr(module, attribute):
+            raise PluginError(f'{kind} "{name}": module {module_name} has no attribute "{attribute}".')
+        return getattr(module, attribute)
+
+    def create(self, kind: str, name: str, /, **options: Any) -> Any:
+        """Load a part and call it with options.
+
+        Raises:
+            InputError: The part does not take one of the options, or not this value of it.
+            MissingExtraError: An optional dependency is not installed; the message holds the command that installs it.
+        """
+        factory = self.load(kind, name)
+        known = _option_names(factory)
+        for option in options:
+            if known is not None and option not in known:
+                raise UnknownNameError(f"option of {kind} {name}", option, known)
+        try:
+            return factory(**options)
+        except CpdeformError:
+            raise
+        except ModuleNotFoundError as error:
+            raise _import_error(kind, self.find(kind, name).spec, error) from error
+        except (TypeError, ValueError) as error:
+            # Options come from the command line as any YAML value; the full scene among them would drown the message.
+            given = {key: value for key, value in options.items() if isinstance(value, (str, int, float, list, dict))}
+            raise InputError(
+                f"options of {kind} {name}", came=str(given or "none"), expected=f"values that it accepts ({error})"
+            ) from error
+
+
+def _import_error(kind: str, spec: PluginSpec, error: Exception) -> CpdeformError:
+    """What to raise when importing a part raised `error`: a missing extra is the user's to install, the rest is the plugin's."""
+    module_name = spec.target.partition(":")[0]
+    missing = error.name if isinstance(error, ModuleNotFoundError) else None
+    if spec.extra and missing and not f"{module_name}.".startswith(f"{missing}."):
+        return MissingExtraError(kind, spec.name, module=missing, install=f'pip install "{spec.extra}"')
+    return PluginError(f'{kind} "{spec.name}": cannot import {module_name}: {type(error).__name__}: {error}')
+
+
+def _option_names(factory: Any) -> list[str] | None:
+    """Names of a factory's keyword parameters; None where it takes any."""
+    parameters = inspect.signature(factory).parameters.values()
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return None
+    return [parameter.name for parameter in parameters]
+
+
+def _distribution(entry_point: importlib.metadata.EntryPoint) -> str:
+    distribution = entry_point.dist
+    return f"{distribution.name} {distribution.version}" if distribution is not None else "unknown distribution"
+
+
+def _register(manager: pluggy.PluginManager, entry_point: importlib.metadata.EntryPoint) -> list[Registration]:
+    """Load one entry point and return what it registers; anything it raises is the caller's to report."""
+    distribution = _distribution(entry_point)
+    plugin = entry_point.load()
+    manager.register(plugin, name=f"{distribution}:{entry_point.name}")
+    try:
+        manager.check_pending()
+        found = []
+        for kind, hook in KINDS.items():
+            others = [other for other in manager.get_plugins() if other is not plugin]
+            for specs in manager.subset_hook_caller(hook, remove_plugins=others)():
+                for spec in specs:
+                    if not isinstance(spec, PluginSpec) or ":" not in spec.target:
+                        raise PluginError(f'{hook} must return PluginSpec with target "module:attribute", got {spec!r}')
+                    found.append(Registration(kind, spec, distribution, entry_point.name))
+        return found
+    except BaseException:
+        manager.unregister(plugin)
+        raise
+
+
+def load_registry(entry_points: Iterable[importlib.metadata.EntryPoint] | None = None) -> Registry:
+    """Discover all plugins.
+
+    Args:
+        entry_points: What to load; the installed entry points of the group `cpdeform` where absent.
+
+    Returns:
+        A fresh registry. Plugins that cannot be loaded are in its `failures`.
+
+    Raises:
+        PluginError: Two plugins register the same name.
+    """
+    manager = pluggy.PluginManager(GROUP)
+    manager.add_hookspecs(hookspecs)
+    registrations: list[Registration] = []
+    failures: list[PluginFailure] = []
+    chosen = importlib.metadata.entry_points(group=GROUP) if entry_points is None else entry_points
+    for entry_point in sorted(chosen, key=lambda item: item.name):
+        try:
+            registrations.extend(_register(manager, entry_point))
+        except (Exception, SystemExit) as error:
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            failures.append(PluginFailure(entry_point.name, _distribution(entry_point), reason, traceback.format_exc()))
+    return Registry(manager, registrations, failures)
+
+
+def _read_value(text: str) -> Any:
+    """Read YAML, with ``1e-3`` a number as in YAML 1.2 (PyYAML, which is YAML 1.1, takes it for text)."""
+    # Imported on use: PyYAML is a tenth of the start-up time of commands that read no option.
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        """A loader of its own, so that the resolver below does not change `yaml.safe_load` for others."""
+
+    number = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+.0123456789"))
+    try:
+        return yaml.load(text, Loader=Loader)
+    except yaml.YAMLError as error:
+        reason = " ".join(str(error).split())
+        raise InputError("--set", came=f'"{text}"', expected="a YAML value after =", remedy=f"YAML says: {reason}") from error
+
+
+def split_options(values: Iterable[str]) -> dict[str, Any]:
+    """Read ``key=value`` assignments, values as YAML, dots nesting: ``a.b=1`` gives ``{"a": {"b": 1}}``.
+
+    Raises:
+        InputError: An assignment has no ``=``, its value is not YAML, or a key is set both as a value and as a group.
+    """
+    result: dict[str, Any] = {}
+    for value in values:
+        key, equals, text = value.partition("=")
+        if not equals or not all(part.strip() for part in key.split(".")):
+            remedy = "For example --set optimizer.learning_rate=0.05"
+            raise InputError("--set", came=f'"{value}"', expected="key=value", remedy=remedy)
+        node = result
+        *parents, last = key.strip().split(".")
+        for parent in parents:
+            node = node.setdefault(parent, {})
+            if not isinstance(node, dict):
+                raise InputError("--set", came=f'"{key}"', expected=f'"{parent}" to be set once, as a value or as a group')
+        if isinstance(node.get(last), dict):
+            raise InputError("--set", came=f'"{key}"', expected=f'"{last}" to be set once, as a value or as a group')
+        node[last] = _read_value(text)
+    return result

@@ -1,0 +1,154 @@
+"""Files of the run record: written under a temporary name, then renamed, so that a reader never sees half a file."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+from torch import Tensor
+
+from cpdeform.core.errors import InputError
+
+RUN_FILE = "run.json"
+METRICS_FILE = "metrics.jsonl"
+TARGET_FILE = "target.h5"
+STAGE_PATTERN = re.compile(r"stage-(\d{3,})\.h5")
+OWN_FILES = (RUN_FILE, METRICS_FILE, TARGET_FILE, "picture.png", "animation.mp4", "animation.gif")
+"""Files, besides the stages', that `overwrite` may remove; pictures are among them since they would show the old run."""
+
+PACKAGES = ("cpdeform", "torch", "warp-lang", "pot", "geomloss", "numpy", "h5py")
+
+
+def stage_file(index: int) -> str:
+    """Name of a stage's file."""
+    return f"stage-{index:03d}.h5"
+
+
+def stage_files(directory: Path) -> list[Path]:
+    """Files of the finished stages in a directory, in order."""
+    return sorted(path for path in directory.iterdir() if STAGE_PATTERN.fullmatch(path.name))
+
+
+def own_files(directory: Path) -> list[Path]:
+    """Files in a directory that belong to a run record, left-over temporary ones included."""
+    return sorted(path for path in directory.iterdir() if path.is_file() and _is_own(path.name))
+
+
+def _is_own(name: str) -> bool:
+    plain = name[1:-4] if name.startswith(".") and name.endswith(".tmp") else name
+    return plain in OWN_FILES or STAGE_PATTERN.fullmatch(plain) is not None
+
+
+def check_directory(directory: Path, *, overwrite: bool) -> None:
+    """Check that a record can be written, and leave the file system as it was.
+
+    Args:
+        directory: The record's directory; it and its parents may be missing.
+        overwrite: Whether it may hold files already.
+
+    Raises:
+        InputError: It is a file, is not empty, or cannot be made or written to.
+    """
+    argument = f"output directory {directory}"
+    if directory.exists() and not directory.is_dir():
+        raise InputError(argument, came="a file", expected="a directory, or a path that does not exist yet")
+    try:
+        if not overwrite and directory.is_dir() and any(directory.iterdir()):
+            raise InputError(
+                argument,
+                came="a directory that is not empty",
+                expected="an empty one, or a path that does not exist yet",
+                remedy="Choose another with --out, or replace the record in it with --overwrite.",
+            )
+        _try_writing(directory)
+    except OSError as error:
+        came = error.strerror or str(error)
+        raise InputError(argument, came=f"a path that cannot be written ({came})", expected="a writable directory") from error
+
+
+def _try_writing(directory: Path) -> None:
+    """Make the directory and a file in it, then remove both; permission bits alone do not tell (root, read-only mounts)."""
+    missing = [path for path in (directory, *directory.parents) if not path.exists()]
+    made: list[Path] = []
+    try:
+        for path in reversed(missing):
+            path.mkdir()
+            made.append(path)
+        probe = directory / f".{RUN_FILE}.tmp"
+        existed = probe.exists()
+        with probe.open("ab"):
+            pass
+        if not existed:
+            probe.unlink()
+    finally:
+        for path in reversed(made):
+            path.rmdir()
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path`; what was written there takes the place of `path` at the end, in one step."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        yield temporary
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def to_json(value: Any) -> Any:
+    """Replace tensors by lists and numbers that are not finite, which JSON cannot hold, by null."""
+    if isinstance(value, Tensor):
+        return to_json(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): to_json(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_json(entry) for entry in value]
+    return value
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file atomically."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(to_json(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def write_dataset(group: h5py.Group, name: str, tensor: Tensor, *, shape: str, units: str) -> None:
+    """Write a tensor with attributes that say what its axes and numbers are."""
+    values = tensor.detach().cpu().numpy()
+    options = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if values.size > 1000 else {}
+    dataset = group.create_dataset(name, data=values, **options)
+    dataset.attrs["shape"] = shape
+    dataset.attrs["units"] = units
+
+
+def read_tensor(group: h5py.Group, name: str) -> Tensor:
+    """Read a dataset as a tensor on the CPU."""
+    return torch.from_numpy(np.asarray(group[name][()]))
+
+
+def environment() -> dict[str, Any]:
+    """Versions of Python and of the packages that make a result, and the machine, without names of persons or hosts."""
+    versions: dict[str, str | None] = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    return {"versions": versions, "platform": platform.platform(), "cpu_count": os.cpu_count()}

@@ -1,0 +1,269 @@
+"""What is simulated: bodies, material, manipulators and the discretisation, as validated frozen models.
+
+Lengths are in units of the domain edge (the domain is the cube [0, 1]^3, y up), times in seconds, density is 1. The
+constants are those of PlasticineLab [1]_, odd ones included, so that results compare.
+
+References:
+    .. [1] Huang et al., "PlasticineLab: A Soft-Body Manipulation Benchmark with Differentiable Physics", ICLR 2021.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegativeFloat = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+WALL_NODES = 3
+"""Width of the boundary layer at each face of the domain, in grid nodes."""
+
+
+class FrozenModel(BaseModel):
+    """Base of all data models: immutable, no unknown fields, no infinities."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Material(FrozenModel):
+    """Fixed-corotated elasticity with von Mises plasticity.
+
+    Attributes:
+        youngs_modulus: Young's modulus E, stress units (density 1, lengths in domain edges, seconds).
+        poisson_ratio: Poisson's ratio nu, dimensionless, in (-1, 0.5).
+        yield_stress: Von Mises yield stress, stress units.
+    """
+
+    youngs_modulus: PositiveFloat = 5000.0
+    poisson_ratio: float = Field(default=0.2, gt=-1.0, lt=0.5)
+    yield_stress: PositiveFloat = 50.0
+
+    @property
+    def shear_modulus(self) -> float:
+        """First Lame parameter mu = E / (2 (1 + nu)), stress units."""
+        return self.youngs_modulus / (2.0 * (1.0 + self.poisson_ratio))
+
+    @property
+    def lame_lambda(self) -> float:
+        """Second Lame parameter lambda = E nu / ((1 + nu)(1 - 2 nu)), stress units."""
+        return self.youngs_modulus * self.poisson_ratio / ((1.0 + self.poisson_ratio) * (1.0 - 2.0 * self.poisson_ratio))
+
+
+class BodyBox(FrozenModel):
+    """An axis-aligned block of clay.
+
+    Attributes:
+        position: Centre, length units.
+        widths: Full edge lengths along x, y, z, length units.
+        particle_count: Number of particles sampled uniformly in the block.
+        material: Material of this body; the scene's material where absent.
+    """
+
+    kind: Literal["box"] = "box"
+    position: Vector3
+    widths: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+    particle_count: int = Field(default=10000, gt=0)
+    material: Material | None = None
+
+    @property
+    def half_extents(self) -> Vector3:
+        """Half of the bounding box's edges, length units."""
+        return (0.5 * self.widths[0], 0.5 * self.widths[1], 0.5 * self.widths[2])
+
+
+class BodySphere(FrozenModel):
+    """A ball of clay.
+
+    Attributes:
+        position: Centre, length units.
+        radius: Radius, length units.
+        particle_count: Number of particles sampled uniformly in the ball.
+        material: Material of this body; the scene's material where absent.
+    """
+
+    kind: Literal["sphere"] = "sphere"
+    position: Vector3
+    radius: PositiveFloat
+    particle_count: int = Field(default=10000, gt=0)
+    material: Material | None = None
+
+    @property
+    def half_extents(self) -> Vector3:
+        """Half of the bounding box's edges, length units."""
+        return (self.radius, self.radius, self.radius)
+
+
+Body = Annotated[BodyBox | BodySphere, Field(discriminator="kind")]
+
+
+class ManipulatorBase(FrozenModel):
+    """A rigid tool, moved by actions or fixed.
+
+    Attributes:
+        position: Start position of the local origin, length units.
+        rotation_wxyz: Start rotation as a unit quaternion (w, x, y, z), local frame to world frame.
+        friction: Coulomb friction coefficient against the clay, dimensionless.
+        action_scale: Motion per environment step at action 1: three translations (length units) and optionally three
+            rotations (radians, world frame). Empty: the tool does not move.
+        lower_bound: The position is clipped to stay above this corner, length units.
+        upper_bound: The position is clipped to stay below this corner, length units.
+    """
+
+    position: Vector3
+    rotation_wxyz: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    friction: NonNegativeFloat = 0.9
+    action_scale: tuple[NonNegativeFloat, ...] = ()
+    lower_bound: Vector3 = (0.0, 0.0, 0.0)
+    upper_bound: Vector3 = (1.0, 1.0, 1.0)
+
+    @model_validator(mode="after")
+    def _check(self) -> ManipulatorBase:
+        if len(self.action_scale) not in (0, 3, 6):
+            count = len(self.action_scale)
+            raise ValueError(f"action_scale has {count} components; give 0 (fixed), 3 (translation) or 6 (+ rotation)")
+        norm = sum(component * component for component in self.rotation_wxyz) ** 0.5
+        if not 0.99 < norm < 1.01:
+            raise ValueError(f"rotation_wxyz has norm {norm:.4g}; give a unit quaternion (w, x, y, z)")
+        if any(low > high for low, high in zip(self.lower_bound, self.upper_bound, strict=True)):
+            raise ValueError("lower_bound exceeds upper_bound")
+        return self
+
+    @property
+    def action_size(self) -> int:
+        """Number of action components this tool takes."""
+        return len(self.action_scale)
+
+    @property
+    def movable(self) -> bool:
+        """Whether any action moves this tool."""
+        return any(scale > 0.0 for scale in self.action_scale)
+
+
+class ManipulatorSphere(ManipulatorBase):
+    """A ball. Attributes: radius, length units."""
+
+    kind: Literal["Sphere"] = "Sphere"
+    radius: PositiveFloat
+
+
+class ManipulatorCapsule(ManipulatorBase):
+    """All points within `radius` of the segment y in [-height/2, height/2] of the local frame, length units."""
+
+    kind: Literal["Capsule"] = "Capsule"
+    radius: PositiveFloat
+    height: PositiveFloat
+
+
+class ManipulatorBox(ManipulatorBase):
+    """A block of `half_extents` (3,), grown by `rounding` on all sides, length units."""
+
+    kind: Literal["Box"] = "Box"
+    half_extents: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+    rounding: NonNegativeFloat = 0.0
+
+
+class ManipulatorCylinder(ManipulatorBase):
+    """A solid cylinder about the local y axis: `radius` and `half_height`, length units."""
+
+    kind: Literal["Cylinder"] = "Cylinder"
+    radius: PositiveFloat
+    half_height: PositiveFloat
+
+
+class ManipulatorTorus(ManipulatorBase):
+    """A ring about the local y axis: `major_radius` to the tube's centre and `tube_radius`, length units."""
+
+    kind: Literal["Torus"] = "Torus"
+    major_radius: PositiveFloat
+    tube_radius: PositiveFloat
+
+
+Manipulator = Annotated[
+    ManipulatorSphere | ManipulatorCapsule | ManipulatorBox | ManipulatorCylinder | ManipulatorTorus,
+    Field(discriminator="kind"),
+]
+
+
+class Scene(FrozenModel):
+    """Everything a simulator needs to know.
+
+    Attributes:
+        bodies: The clay, one entry a body, in the order of the particles.
+        manipulators: The tools, in the order of the actions and of the pose tensor's second axis.
+        material: Material of bodies that name none.
+        gravity_parameter: Gravity as the scene tables give it, dimensionless; the acceleration is `gravity_scale` times it.
+        gravity_scale: Acceleration per unit of gravity parameter, length/second^2 (PlasticineLab's quirk: 30).
+        ground_friction: 0 slips, below 10 Coulomb, 10 and above sticks; dimensionless.
+        ground_height: Height of the floor, length units.
+        grid_size: Grid nodes along each axis; the node distance dx is 1/grid_size.
+        time_step: Seconds per substep.
+        substeps: Substeps per environment step.
+        softness: Decay rate of a tool's influence outside its surface, 1/length; 0 gives a hard boundary.
+        sampling_seed: Seed of the particle positions inside the bodies.
+    """
+
+    bodies: tuple[Body, ...] = Field(min_length=1)
+    manipulators: tuple[Manipulator, ...] = ()
+    material: Material = Material()
+    gravity_parameter: Vector3 = (0.0, -1.0, 0.0)
+    gravity_scale: NonNegativeFloat = 30.0
+    ground_friction: NonNegativeFloat = 1.5
+    ground_height: NonNegativeFloat = 0.0
+    grid_size: int = Field(default=64, ge=8, le=512)
+    time_step: PositiveFloat = 1e-4
+    substeps: int = Field(default=19, ge=1)
+    softness: NonNegativeFloat = 666.0
+    sampling_seed: int = Field(default=0, ge=0)
+
+    @model_validator(mode="after")
+    def _check_bodies_inside(self) -> Scene:
+        lower, upper = self.domain
+        for index, body in enumerate(self.bodies):
+            for axis, name in enumerate("xyz"):
+                low = body.position[axis] - body.half_extents[axis]
+                high = body.position[axis] + body.half_extents[axis]
+                if low < lower[axis] - 1e-6 or high > upper[axis] + 1e-6:
+                    raise ValueError(
+                        f"bodies.{index} spans [{low:.4g}, {high:.4g}] along {name}, outside the domain "
+                        f"[{lower[axis]:.4g}, {upper[axis]:.4g}]; move or shrink the body"
+                    )
+        return self
+
+    @property
+    def node_distance(self) -> float:
+        """Distance dx between grid nodes, length units."""
+        return 1.0 / self.grid_size
+
+    @property
+    def particle_volume(self) -> float:
+        """Volume of a particle, (dx/2)^2 (PlasticineLab's quirk: a 2-D formula). Density is 1, so this is its mass, too."""
+        return (0.5 * self.node_distance) ** 2
+
+    @property
+    def domain(self) -> tuple[Vector3, Vector3]:
+        """Corners that particle positions are clipped to, length units."""
+        upper = 1.0 - WALL_NODES * self.node_distance
+        return (0.0, self.ground_height, 0.0), (upper, upper, upper)
+
+    @property
+    def gravity(self) -> Vector3:
+        """Acceleration, length/second^2."""
+        x, y, z = self.gravity_parameter
+        return (self.gravity_scale * x, self.gravity_scale * y, self.gravity_scale * z)
+
+    @property
+    def particle_count(self) -> int:
+        """Number of particles of all bodies together."""
+        return sum(body.particle_count for body in self.bodies)
+
+    @property
+    def action_size(self) -> int:
+        """Number of action components of all manipulators together."""
+        return sum(manipulator.action_size for manipulator in self.manipulators)
+
+    def material_of(self, body: int) -> Material:
+        """Material of the body with the given index."""
+        return self.bodies[body].material or self.material

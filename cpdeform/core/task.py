@@ -1,0 +1,275 @@
+"""Tasks: a scene, a target shape and a schedule, read from YAML files."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.resources
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field, ValidationError
+
+from cpdeform.core.errors import InputError, PluginError, UnknownNameError
+from cpdeform.core.plugins import Registry, load_registry
+from cpdeform.core.scene import FrozenModel, Scene
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class Task(FrozenModel):
+    """A shape to be made.
+
+    Attributes:
+        name: Name with variant, e.g. ``"writer-v2"``.
+        summary: One line for listings.
+        scene: What is simulated.
+        target: File of the target particles, see `load_target`.
+        step_count: Environment steps T of one stage.
+        stage_count: Number of stages that the task is meant for.
+        metric: What the result is judged by.
+    """
+
+    name: str
+    summary: str = ""
+    scene: Scene
+    target: Path
+    step_count: int = Field(default=10, ge=1)
+    stage_count: int = Field(default=1, ge=1)
+    metric: Literal["incremental_iou", "wasserstein"] = "wasserstein"
+
+    def load_target(self) -> NDArray[np.float64]:
+        """Read the goal particles.
+
+        Returns:
+            Positions (M, 3), length units.
+
+        Raises:
+            InputError: The file is missing or unreadable, or holds something else than finite positions in the domain.
+        """
+        return load_target(self.target, scene=self.scene)
+
+
+def load_target(path: Path, *, scene: Scene) -> NDArray[np.float64]:
+    """Read target particles from ``.npz`` with an array ``position`` (M, 3), or from ``.npy`` with such an array.
+
+    Integer arrays are positions in units of 2^-16 (compact files), others are in length units.
+
+    Args:
+        path: The file.
+        scene: Its domain must hold the target.
+
+    Returns:
+        Positions (M, 3), length units.
+
+    Raises:
+        InputError: The file is missing or unreadable, or holds something else than finite positions in the domain.
+    """
+    argument = f"target file {path}"
+    try:
+        with contextlib.ExitStack() as stack:
+            loaded = np.load(path, allow_pickle=False)
+            if isinstance(loaded, np.lib.npyio.NpzFile):
+                loaded = stack.enter_context(loaded)["position"]
+            values = np.asarray(loaded)
+    except FileNotFoundError as error:
+        raise InputError(argument, came="no such file", expected="an .npz or .npy file of target particles") from error
+    except KeyError as error:
+        raise InputError(argument, came="no array of that name", expected='an array "position" of shape (M, 3)') from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(argument, came=f"unreadable content ({error})", expected="an .npz or .npy file of numbers") from error
+    if values.ndim != 2 or values.shape[1] != 3 or not len(values) or values.dtype.kind not in "fui":
+        raise InputError(argument, came=f"{values.dtype} of shape {values.shape}", expected="positions of shape (M, 3), M >= 1")
+    positions = values.astype(np.float64) * (1.0 if values.dtype.kind == "f" else 2.0**-16)
+    bad = int((~np.isfinite(positions)).any(axis=1).sum())
+    if bad:
+        came = f"{bad} particles with nan or infinity"
+        raise InputError(argument, came=came, expected="finite positions", remedy="Make the file anew.")
+    lower, upper = scene.domain
+    outside = int(((positions < np.asarray(lower) - 1e-4) | (positions > np.asarray(upper) + 1e-4)).any(axis=1).sum())
+    if outside:
+        raise InputError(
+            argument,
+            came=f"{outside} of {len(positions)} particles outside the domain",
+            expected=f"positions within {lower} and {upper}",
+            remedy="Scale or shift the target.",
+        )
+    return positions
+
+
+def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Overlay nested mappings; a list is changed entry by entry where `changes` maps indices to changes."""
+    result = dict(base)
+    for key, value in changes.items():
+        current = result.get(key)
+        if isinstance(value, Mapping) and isinstance(current, Mapping):
+            result[key] = merge(current, value)
+        elif isinstance(value, Mapping) and isinstance(current, (list, tuple)):
+            result[key] = _merge_list(key, current, value)
+        else:
+            result[key] = value
+    return result
+
+
+def _merge_list(name: str, base: list[Any] | tuple[Any, ...], changes: Mapping[str, Any]) -> list[Any]:
+    items = list(base)
+    for key, value in changes.items():
+        index = int(key) if str(key).isdigit() else -1
+        if not 0 <= index < len(items):
+            raise InputError(f"{name}.{key}", came=f'"{key}"', expected=f"an index from 0 to {len(items) - 1}")
+        items[index] = merge(items[index], value) if isinstance(value, Mapping) and isinstance(items[index], Mapping) else value
+    return items
+
+
+def validate(model: type[Model], data: Any, *, source: str) -> Model:
+    """Build a pydantic model; its errors become one `InputError` that names the field.
+
+    Args:
+        model: The model class.
+        data: What to read it from.
+        source: Where the data come from, for the message.
+
+    Raises:
+        InputError: The data do not fit the model.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = ".".join(str(part) for part in first["loc"]) or "content"
+        if first["type"] == "extra_forbidden":
+            *path, name = first["loc"]
+            raise UnknownNameError(f"{source}: field {field}", str(name), _field_names(model, path)) from error
+        came = repr(first["input"])
+        message = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+        count = error.error_count() - 1
+        more = f" ({count} more error{'s' if count > 1 else ''})" if count else ""
+        raise InputError(
+            f"{source}: {field}",
+            came=came if len(came) <= 120 else came[:117] + "...",
+            expected=message[0].lower() + message[1:] + more,
+        ) from error
+
+
+def _field_names(model: type[BaseModel], path: Sequence[int | str]) -> list[str]:
+    """Names of the fields at a path of a validation error: field names, list indices, and tags that choose from a union."""
+    models = {model}
+    for part in path:
+        if isinstance(part, int):
+            continue
+        annotations = [item.model_fields[part].annotation for item in models if part in item.model_fields]
+        if annotations:
+            models = set().union(*(_models_in(annotation) for annotation in annotations))
+        else:
+            models = {item for item in models if "kind" in item.model_fields and item.model_fields["kind"].default == part}
+    return sorted({name for item in models for name in item.model_fields})
+
+
+def _models_in(annotation: Any) -> set[type[BaseModel]]:
+    """All models that a type annotation mentions."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return {annotation}
+    return set().union(*(_models_in(part) for part in get_args(annotation)))
+
+
+def _read_mapping(path: Path) -> dict[str, Any]:
+    """Content of a task file, not validated beyond being a mapping."""
+    argument = f"task file {path}"
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(argument, came="no such file", expected="a YAML file") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(argument, came=f"unreadable content ({error})", expected="a YAML file") from error
+    except (yaml.YAMLError, ValueError) as error:
+        raise InputError(argument, came=f"malformed YAML ({' '.join(str(error).split())})", expected="YAML") from error
+    if not isinstance(content, dict):
+        raise InputError(argument, came=type(content).__name__, expected="a mapping with the fields of a task")
+    return content
+
+
+def read_task(path: Path, *, variant: str | None = None) -> Task:
+    """Read a task file.
+
+    The file holds the fields of `Task`; a relative `target` is relative to the file. Under `variants`, names map to changes of
+    these fields; without a variant's name the first one applies.
+
+    Args:
+        path: A YAML file.
+        variant: Name of a variant.
+
+    Raises:
+        InputError: The file is missing, is not YAML, or has a field that is unknown, missing or out of range.
+        UnknownNameError: There is no such variant.
+    """
+    content = _read_mapping(path)
+    variants = content.pop("variants", None) or {}
+    if not isinstance(variants, dict):
+        raise InputError(f"task file {path}: variants", came=type(variants).__name__, expected="a mapping of names to changes")
+    variants = {str(key): changes or {} for key, changes in variants.items()}
+    base = content.get("name", path.stem)
+    if variant is None and variants:
+        variant = next(iter(variants))
+    if variant is not None:
+        if variant not in variants:
+            raise UnknownNameError(f"variant of task {base}", variant, variants)
+        if not isinstance(variants[variant], dict):
+            came = type(variants[variant]).__name__
+            raise InputError(f"task file {path}: variants.{variant}", came=came, expected="a mapping of fields to changes")
+        content = merge(content, variants[variant])
+        content["name"] = f"{base}-{variant}"
+    content.setdefault("name", base)
+    if isinstance(content.get("target"), str):
+        content["target"] = path.parent / content["target"]
+    return validate(Task, content, source=f"task file {path}")
+
+
+def list_variants(path: Path) -> list[str]:
+    """Names of the variants in a task file, in its order.
+
+    Raises:
+        InputError: The file is missing or is no YAML mapping.
+    """
+    content = _read_mapping(path)
+    variants = content.get("variants") or {}
+    return [str(name) for name in variants] if isinstance(variants, dict) else []
+
+
+def task_path(name: str, *, registry: Registry) -> Path:
+    """Path of a registered task's file.
+
+    Raises:
+        UnknownNameError: No plugin registers the name.
+        PluginError: The plugin's package cannot be imported.
+    """
+    package, _, file = registry.find("task", name).spec.target.partition(":")
+    try:
+        return Path(str(importlib.resources.files(package) / file))
+    except Exception as error:
+        raise PluginError(f'task "{name}": cannot import {package}: {type(error).__name__}: {error}') from error
+
+
+def load_task(name: str | Path, *, registry: Registry | None = None) -> Task:
+    """Load a task by name (``"writer"``, ``"writer-v3"``) or from a YAML file (``"my_vase.yaml"``).
+
+    Args:
+        name: Registered name, with a variant or without (then the first variant), or path of a YAML file.
+        registry: Where to look names up; the installed plugins where absent.
+
+    Raises:
+        UnknownNameError: No plugin registers the name.
+        InputError: The file cannot be used.
+    """
+    if isinstance(name, Path) or name.endswith((".yaml", ".yml")):
+        return read_task(Path(name))
+    registry = registry or load_registry()
+    known = registry.names("task")
+    base, dash, variant = name.rpartition("-")
+    if name not in known and dash and base in known:
+        return read_task(task_path(base, registry=registry), variant=variant)
+    return read_task(task_path(name, registry=registry))

@@ -1,0 +1,1 @@
+"""Placers: where to put the tools before their motion is optimised."""

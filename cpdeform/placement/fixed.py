@@ -1,0 +1,15 @@
+"""The placer that moves nothing: PlasticineLab's own protocol."""
+
+from __future__ import annotations
+
+from cpdeform.core.placer import Placement, Placer, PlacerCapabilities, Stage
+
+
+class PlacerFixed(Placer):
+    """Tools stay where the current state has them, also where they touch or overlap the body."""
+
+    capabilities = PlacerCapabilities(needs_priorities=False, max_manipulators=None)
+
+    def ask(self, stage: Stage) -> list[Placement]:
+        """Propose the current poses as the only candidate."""
+        return [Placement(pose=stage.state.manipulator_pose[0].clone(), score=float("nan"), label="fixed")]
