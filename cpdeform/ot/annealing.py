@@ -19,6 +19,7 @@ References:
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import torch
@@ -56,12 +57,10 @@ class Schedule:
     iterations: int
 
     def blurs(self, first: float, last: float) -> list[float]:
-        """Geometric sequence from `first` down to exactly `last`."""
-        result = []
-        while first > last * 1.001:
-            result.append(first)
-            first *= self.scaling
-        return [*result, last]
+        """Geometric sequence from `first` down to exactly `last`, with ratios of about `scaling`."""
+        steps = round(math.log(last / first) / math.log(self.scaling)) if first > last else 0
+        steps = max(steps, 1 if first > last * 1.001 else 0)
+        return [last * (first / last) ** (1 - step / steps) for step in range(steps)] + [last]
 
 
 def solve_cold(problem: Problem, schedule: Schedule, start: Start, descent: Descent) -> tuple[Potentials, int]:

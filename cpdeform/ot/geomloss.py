@@ -143,7 +143,7 @@ class OTSolverGeomLoss(OTSolver):
         source, target = problem.source, problem.target
         with torch.no_grad():  # GeomLoss leaves gradients switched on behind it; this switches them off again
             first, second = loss(source.weights, source.points, target.weights, target.points)
-        return first.detach(), second.detach()
+        return first.detach().view(-1), second.detach().view(-1)  # it adds a batch axis
 
     def _paper(self, problem: Problem) -> OTResult:
         """The paper's loss: GeomLoss alone, its gradient by automatic differentiation."""
@@ -159,7 +159,7 @@ class OTSolverGeomLoss(OTSolver):
         )
         with torch.enable_grad():
             points = source.points.clone().requires_grad_(True)
-            f, g = loss(source.weights, points, target.weights, target.points)
+            f, g = (potential.view(-1) for potential in loss(source.weights, points, target.weights, target.points))
             value = (source.weights * f).sum() + (target.weights * g).sum()
             (gradient,) = torch.autograd.grad(value, points)
         source_potential, target_potential = fix_gauge(f.detach(), g.detach(), source.weights)

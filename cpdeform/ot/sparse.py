@@ -169,7 +169,7 @@ def self_potential(problem: Problem, side: Side, *, tolerance: float, limit: int
         limit: Most iterations.
     """
     itself = problem.self_problem(side)
-    f = symmetric_update(itself, symmetric_update(itself, torch.zeros_like(side.weights)))
+    f = symmetric_update(itself, torch.zeros_like(side.weights))
     kernels = stabilised_kernel(itself, f, (f, f))
     if kernels is None:
         for _ in range(limit):
@@ -186,4 +186,4 @@ def self_potential(problem: Problem, side: Side, *, tolerance: float, limit: int
         u = (u / product).sqrt_()
         if error < tolerance:
             break
-    return symmetric_update(itself, f + itself.epsilon * u.log())
+    return f + itself.epsilon * u.log()

@@ -1,1 +1,7 @@
 """Pictures and animations of run records."""
+
+from __future__ import annotations
+
+from cpdeform.report.pictures import draw_run
+
+__all__ = ["draw_run"]

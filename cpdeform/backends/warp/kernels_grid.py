@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from cpdeform.backends.warp.kernels_distance import build_distance
-from cpdeform.backends.warp.kernels_types import build_types
+from cpdeform.backends.warp.kernels_types import KERNEL_OPTIONS, build_types
 from cpdeform.core.scene import WALL_NODES
 
 
@@ -161,7 +161,7 @@ def build_grid(real: Any) -> SimpleNamespace:
         v = velocity
         if wall_blocks(parameters, node[0], v[0]):
             v[0] = zero
-        if real(node[1]) < parameters.ground_nodes and v[1] < zero:
+        if node[1] < parameters.ground_nodes and v[1] < zero:
             if parameters.ground_friction >= sticky_friction:
                 v = vec3(zero, zero, zero)
             else:
@@ -183,7 +183,7 @@ def build_grid(real: Any) -> SimpleNamespace:
         block_x = wall_blocks(parameters, node[0], v[0])
         if block_x:
             v[0] = zero
-        floor = real(node[1]) < parameters.ground_nodes and v[1] < zero
+        floor = node[1] < parameters.ground_nodes and v[1] < zero
         after = v
         slip = vec4(zero, zero, zero, one)
         if floor:
@@ -231,7 +231,7 @@ def build_grid(real: Any) -> SimpleNamespace:
             total += grid[world + r * worlds, index]
         return total
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(**KERNEL_OPTIONS)
     def update_grid(
         grid: wp.array2d(dtype=vec4),
         rows: int,
@@ -260,7 +260,7 @@ def build_grid(real: Any) -> SimpleNamespace:
             v = boundary(parameters, number, v)
         result[world, index] = vec4(v[0], v[1], v[2], zero)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(**KERNEL_OPTIONS)
     def update_grid_adjoint(
         grid: wp.array2d(dtype=vec4),
         rows: int,

@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from cpdeform.backends.warp.kernels_types import build_types
+from cpdeform.backends.warp.kernels_types import KERNEL_OPTIONS, build_types
 
 
 @functools.cache
@@ -79,7 +79,7 @@ def build_motion(real: Any) -> SimpleNamespace:
                 result[a] = tool.scale[a + 3] * actions[world, step, o + a]
         return result
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(**KERNEL_OPTIONS)
     def move_tools(actions: wp.array3d(dtype=real), tools: wp.array(dtype=Tool), substeps: int, poses: wp.array3d(dtype=vec8)):
         """Fill frames 1.. of `poses` (worlds, steps * substeps + 1, tools) from frame 0."""
         world, m = wp.tid()
@@ -96,7 +96,7 @@ def build_motion(real: Any) -> SimpleNamespace:
             pose = vec8(p[0], p[1], p[2], q[0], q[1], q[2], q[3], pose[7])
             poses[world, frame + 1, m] = pose
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(**KERNEL_OPTIONS)
     def move_tools_adjoint(
         actions: wp.array3d(dtype=real),
         tools: wp.array(dtype=Tool),

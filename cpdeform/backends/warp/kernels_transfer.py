@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from cpdeform.backends.warp.kernels_material import build_material
-from cpdeform.backends.warp.kernels_types import build_types
+from cpdeform.backends.warp.kernels_types import KERNEL_OPTIONS, build_types
 
 
 @functools.cache
@@ -26,7 +26,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
     trial_strain, material, material_adjoint, trial_adjoint = (
         law.trial_strain, law.material, law.material_adjoint, law.trial_adjoint,
     )
-    entries, symmetric = law.entries, law.symmetric
+    entries, symmetric, eigen, stress_of = law.entries, law.symmetric, law.eigen, law.stress_of
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     four = real(4.0)
 
@@ -85,16 +85,17 @@ def build_transfer(real: Any) -> SimpleNamespace:
     ):
         """Add w (start + i ax + j ay + k az) to the 27 nodes."""
         node = ((base[0] - origin[0]) * size[1] + base[1] - origin[1]) * size[2] + base[2] - origin[2]
+        steps = vec3(zero, one, two)
         for i in range(3):
             for j in range(3):
                 w = wx[i] * wy[j]
-                value = start + real(i) * ax + real(j) * ay
+                value = start + steps[i] * ax + steps[j] * ay
                 n = node + (i * size[1] + j) * size[2]
                 wp.atomic_add(grid, row, n, (w * wz[0]) * value)
                 wp.atomic_add(grid, row, n + 1, (w * wz[1]) * (value + az))
                 wp.atomic_add(grid, row, n + 2, (w * wz[2]) * (value + two * az))
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(**KERNEL_OPTIONS)
     def bounds(
         position: wp.array2d(dtype=vec3),
         parameters: Parameters,
@@ -110,7 +111,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
         result[0] = low
         result[1] = high + wp.vec3i(2, 2, 2)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(**KERNEL_OPTIONS)
     def particles_to_grid(
         position: wp.array2d(dtype=vec3),
         velocity: wp.array2d(dtype=vec3),
@@ -143,7 +144,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
             extend(column(a, 0), zero), extend(column(a, 1), zero), extend(column(a, 2), zero),
         )
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(**KERNEL_OPTIONS)
     def grid_to_particles(
         position: wp.array2d(dtype=vec3),
         grid: wp.array2d(dtype=vec4),
@@ -164,6 +165,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
         node = ((base[0] - origin[0]) * size[1] + base[1] - origin[1]) * size[2] + base[2] - origin[2]
         total = vec4(zero, zero, zero, zero)
         bx, by, bz = total, total, total
+        steps = vec3(zero, one, two)
         for i in range(3):
             for j in range(3):
                 n = node + (i * size[1] + j) * size[2]
@@ -172,8 +174,8 @@ def build_transfer(real: Any) -> SimpleNamespace:
                 w = wx[i] * wy[j]
                 line = w * (wz[0] * grid[world, n] + middle + last)
                 total += line
-                bx += real(i) * line
-                by += real(j) * line
+                bx += steps[i] * line
+                by += steps[j] * line
                 bz += w * (middle + two * last)
         v = first_three(total)
         scale = four * parameters.inverse_distance
@@ -185,7 +187,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
         moved = x + parameters.time_step * v
         new_position[world, p] = wp.min(wp.max(moved, parameters.lower), parameters.upper)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(**KERNEL_OPTIONS)
     def grid_to_particles_adjoint(
         position: wp.array2d(dtype=vec3),
         new_velocity: wp.array2d(dtype=vec3),
@@ -221,10 +223,11 @@ def build_transfer(real: Any) -> SimpleNamespace:
         scatter(grad_grid, row + world, base, origin, size, wx, wy, wz, start, ax, ay, az)
         node = ((base[0] - origin[0]) * size[1] + base[1] - origin[1]) * size[2] + base[2] - origin[2]
         sx, sy, sz = zero, zero, zero
+        steps = vec3(zero, one, two)
         for i in range(3):
             for j in range(3):
                 n = node + (i * size[1] + j) * size[2]
-                value = start + real(i) * ax + real(j) * ay
+                value = start + steps[i] * ax + steps[j] * ay
                 g0 = wp.dot(grid[world, n], value)
                 g1 = wp.dot(grid[world, n + 1], value + az)
                 g2 = wp.dot(grid[world, n + 2], value + two * az)
@@ -235,7 +238,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
         slope = vec3(sx, sy, sz) - wp.transpose(gc) * v
         grad_position[world, p] = gx + parameters.inverse_distance * slope
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(**KERNEL_OPTIONS)
     def particles_to_grid_adjoint(
         position: wp.array2d(dtype=vec3),
         velocity: wp.array2d(dtype=vec3),
@@ -259,7 +262,8 @@ def build_transfer(real: Any) -> SimpleNamespace:
         e = strain[world, p]
         k = constants[p]
         trial = trial_strain(e, c, parameters.time_step)
-        new, stress = material(trial, k[0], k[1], k[2])
+        values, u0, u1, u2 = eigen(trial)
+        stress = stress_of(values, u0, u1, u2, k[0], k[1], k[2])
         x = position[world, p]
         base = base_node(x, parameters.inverse_distance)
         f = fraction(x, base, parameters.inverse_distance)
@@ -272,10 +276,11 @@ def build_transfer(real: Any) -> SimpleNamespace:
         total = vec4(zero, zero, zero, zero)
         bx, by, bz = total, total, total
         sx, sy, sz = zero, zero, zero
+        steps = vec3(zero, one, two)
         for i in range(3):
             for j in range(3):
                 n = node + (i * size[1] + j) * size[2]
-                value = start + real(i) * ax + real(j) * ay
+                value = start + steps[i] * ax + steps[j] * ay
                 n0 = grad_grid[world, n]
                 n1 = grad_grid[world, n + 1]
                 n2 = grad_grid[world, n + 2]
@@ -287,8 +292,8 @@ def build_transfer(real: Any) -> SimpleNamespace:
                 last = wz[2] * n2
                 row = w * (wz[0] * n0 + middle + last)
                 total += row
-                bx += real(i) * row
-                by += real(j) * row
+                bx += steps[i] * row
+                by += steps[j] * row
                 bz += w * (middle + two * last)
                 line = wz[0] * g0 + wz[1] * g1 + wz[2] * g2
                 sx += dx[i] * wy[j] * line
@@ -303,7 +308,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
         grad_position[world, p] = grad_position[world, p] + parameters.inverse_distance * slope
         grad_velocity[world, p] = parameters.particle_mass * gp
         gs = (half * parameters.stress_scale) * (ga + wp.transpose(ga))
-        gt = material_adjoint(trial, k[0], k[1], k[2], symmetric(grad_strain[world, p]), gs)
+        gt = material_adjoint(values, u0, u1, u2, k[0], k[1], k[2], symmetric(grad_strain[world, p]), gs)
         ge, gd = trial_adjoint(e, c, parameters.time_step, gt)
         grad_strain[world, p] = entries(ge)
         grad_affine[world, p] = parameters.particle_mass * ga + gd

@@ -15,6 +15,13 @@ SPHERE, CAPSULE, BOX, CYLINDER, TORUS = range(5)
 KIND_NUMBERS = {"Sphere": SPHERE, "Capsule": CAPSULE, "Box": BOX, "Cylinder": CYLINDER, "Torus": TORUS}
 """Numbers of the manipulator kinds inside kernels."""
 
+KERNEL_OPTIONS: dict[str, Any] = {
+    "enable_backward": False,
+    "module": "unique",
+    "module_options": {"enable_backward": False},
+}
+"""Options of every kernel: adjoints are written by hand, so Warp makes none."""
+
 
 @functools.cache
 def build_types(real: Any) -> SimpleNamespace:
@@ -42,7 +49,7 @@ def build_types(real: Any) -> SimpleNamespace:
         gravity: vec3  # length / second^2
         softness: real  # 1 / length
         ground_friction: real
-        ground_nodes: real  # floor's boundary layer reaches below this node number
+        ground_nodes: int  # nodes below this number are the floor's boundary layer
         lower: vec3  # positions are clipped to these corners
         upper: vec3
         grid_size: int

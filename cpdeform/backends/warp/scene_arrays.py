@@ -47,7 +47,8 @@ def make_parameters(scene: Scene, real: Any) -> Any:
     parameters.gravity = types.vec3(*scene.gravity)
     parameters.softness = scene.softness
     parameters.ground_friction = scene.ground_friction
-    parameters.ground_nodes = WALL_NODES + scene.ground_height / distance
+    # whole nodes: PlasticineLab truncates the ground height to its grid
+    parameters.ground_nodes = WALL_NODES + int(scene.ground_height / distance)
     parameters.lower = types.vec3(*lower)
     parameters.upper = types.vec3(*upper)
     parameters.grid_size = scene.grid_size

@@ -95,7 +95,7 @@ class _MassGrid(torch.autograd.Function):
         result = torch.empty_like(frames)
         for frame, part in _chunks(frames):
             nodes, weights, slopes = _stencil(frames[frame, part], size)
-            values = grads[0][frame][nodes]
+            values = grads[0][frame].index_select(0, nodes.reshape(-1)).reshape(nodes.shape)
             for axis in range(3):
                 rows = [slopes[:, other] if other == axis else weights[:, other] for other in range(3)]
                 result[frame, part, axis] = size * (_products(*rows) * values).sum(dim=1)

@@ -1,0 +1,188 @@
+"""A small renderer in numpy: clay as a shaded surface of particles, tools as solids, from one camera without perspective.
+
+Particles are drawn as balls into a depth buffer, whose smoothed slope gives the shading: a groove a few particles deep is
+plain to see, where a scatter plot shows a cloud of dots.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+LIGHT = np.array([-0.55, 0.75, 0.35])
+"""Direction to the light in the world frame: low over one side, so that dents throw shade."""
+
+TOOL_COLOUR = np.array([0.27, 0.42, 0.62])
+TOOL_OPACITY = 0.72
+INDEX_BITS = 24
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """An orthographic camera; y of the world is up.
+
+    Attributes:
+        azimuth: Direction it looks from, about the y axis, from z towards x, degrees.
+        elevation: Direction it looks from, above the horizon, degrees.
+        centre: Point in the middle of the picture (3,), length units.
+        half_width: Half of the width that is seen, length units.
+        half_height: Half of the height that is seen, length units.
+    """
+
+    azimuth: float
+    elevation: float
+    centre: Array
+    half_width: float
+    half_height: float
+
+    @property
+    def axes(self) -> Array:
+        """Unit vectors (3, 3) to the right, up, and towards the camera, as rows."""
+        azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
+        right = np.array([np.cos(azimuth), 0.0, -np.sin(azimuth)])
+        towards = np.array([np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)])
+        return np.stack([right, np.cross(towards, right), towards])
+
+    def project(self, points: Array) -> Array:
+        """Coordinates (..., 3) of points (..., 3): right, up, towards the camera, from the picture's centre, length units."""
+        return np.asarray((points - self.centre) @ self.axes.T)
+
+
+def fit_camera(points: Array, *, azimuth: float, elevation: float, aspect: float, margin: float = 0.08) -> Camera:
+    """A camera that sees all points (K, 3).
+
+    Args:
+        points: What has to be in the picture, length units.
+        azimuth: See `Camera`, degrees.
+        elevation: See `Camera`, degrees.
+        aspect: Width of the picture divided by its height.
+        margin: Free space on each side, as a fraction of the extent.
+    """
+    view = Camera(azimuth, elevation, np.zeros(3), 1.0, 1.0)
+    seen = view.project(points)
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    half = np.maximum(0.5 * (high - low)[:2], 1e-3) * (1.0 + 2.0 * margin)
+    half_height = max(float(half[1]), float(half[0]) / aspect)
+    return Camera(azimuth, elevation, (0.5 * (low + high)) @ view.axes, half_height * aspect, half_height)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Layer:
+    """Nearest surface at each pixel: depth (H, W) towards the camera (-inf: none) and index (H, W) of its point."""
+
+    depth: Array
+    index: NDArray[np.int64]
+    mask: NDArray[np.bool_]
+
+
+def render(
+    camera: Camera, *, width: int, particles: Array, colours: Array, radius: float, tools: Sequence[Array] = (), quality: int = 2
+) -> Array:
+    """Draw particles and tools.
+
+    Args:
+        camera: From where.
+        width: Width of the picture, pixels; its height follows from the camera.
+        particles: Positions (N, 3), length units.
+        colours: Colours (N, 3), in [0, 1].
+        radius: Radius of the balls that the particles are drawn as, length units.
+        tools: Surfaces (R, C, 3) from `cpdeform.report.shapes.tool_surface`.
+        quality: Pixels are averages of `quality` x `quality` samples.
+
+    Returns:
+        Picture (H, width, 4) with opacity, colours not premultiplied, in [0, 1].
+    """
+    shape = (max(round(width * camera.half_height / camera.half_width), 1) * quality, width * quality)
+    scale = 0.5 * shape[1] / camera.half_width
+    clay = _draw_points(camera, shape, particles, radius)
+    sigma = max(0.55 * radius * scale, 0.7)
+    colour, depth = _shade_clay(camera, clay, colours, sigma, scale)
+    opacity = clay.mask.astype(np.float64)
+    for tool in tools:
+        layer = _draw_points(camera, shape, tool.reshape(-1, 3), 1.3 / scale)
+        smooth = _fill(layer.depth, layer.mask, 1.0)
+        shade = _lambert(camera, smooth, scale)[..., None]
+        drawn = np.clip(TOOL_COLOUR * (0.45 + 0.7 * shade) + 0.25 * np.clip(shade, 0.0, 1.0) ** 12, 0.0, 1.0)
+        front = layer.mask & (~clay.mask | (layer.depth > depth))
+        share = np.where(front, TOOL_OPACITY, 0.0)
+        total = share + opacity * (1.0 - share)
+        weight = np.divide(share, total, out=np.zeros_like(total), where=total > 0.0)[..., None]
+        colour = weight * drawn + (1.0 - weight) * colour
+        opacity = total
+    return _average(colour, opacity, quality)
+
+
+def _draw_points(camera: Camera, shape: tuple[int, int], points: Array, radius: float) -> _Layer:
+    """Draw points as balls into a depth buffer of (H, W) samples."""
+    height, width = shape
+    scale = 0.5 * width / camera.half_width
+    seen = camera.project(points)
+    column = np.floor((seen[:, 0] + camera.half_width) * scale).astype(np.int64)
+    row = np.floor((camera.half_height - seen[:, 1]) * scale).astype(np.int64)
+    low, span = float(seen[:, 2].min()) - radius, float(np.ptp(seen[:, 2])) + 3.0 * radius
+    # Depth and index share one integer, depth in front: the largest is the nearest ball and tells which one it is.
+    unit = float(2**36) / span
+    buffer = np.full(height * width, -1, dtype=np.int64)
+    reach = int(np.ceil(radius * scale))
+    number = np.arange(len(points))
+    for down in range(-reach, reach + 1):
+        for right in range(-reach, reach + 1):
+            bulge = radius**2 - (down**2 + right**2) / scale**2
+            if bulge < 0.0:
+                continue
+            x, y = column + right, row + down
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            near = ((seen[:, 2] + np.sqrt(bulge) - low) * unit).astype(np.int64)
+            key = (near << INDEX_BITS) | number
+            np.maximum.at(buffer, (y * width + x)[inside], key[inside])
+    buffer = buffer.reshape(shape)
+    mask = buffer >= 0
+    depth = np.where(mask, (buffer >> INDEX_BITS) / unit + low, -np.inf)
+    return _Layer(depth, np.where(mask, buffer & (2**INDEX_BITS - 1), 0), mask)
+
+
+def _fill(values: Array, mask: NDArray[np.bool_], sigma: float) -> Array:
+    """Smooth values (H, W) or (H, W, K) over the mask with a Gaussian of `sigma` samples; beyond it they are continued."""
+    from scipy.ndimage import gaussian_filter
+
+    sigmas = (sigma, sigma, 0.0)[: values.ndim]
+    weight = gaussian_filter(mask.astype(np.float64), sigma)
+    inside = mask if values.ndim == 2 else mask[..., None]
+    total = gaussian_filter(np.where(inside, values, 0.0), sigmas)
+    divisor = np.maximum(weight, 1e-9)
+    return np.asarray(total / (divisor if values.ndim == 2 else divisor[..., None]))
+
+
+def _lambert(camera: Camera, depth: Array, scale: float) -> Array:
+    """Cosine (H, W) between the surface's normal and the light, 0 where it is turned away."""
+    down, right = np.gradient(depth * scale)
+    normal = np.stack([-right, down, np.ones_like(depth)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    light = camera.axes @ (LIGHT / np.linalg.norm(LIGHT))
+    return np.clip(normal @ light, 0.0, 1.0)
+
+
+def _shade_clay(camera: Camera, clay: _Layer, colours: Array, sigma: float, scale: float) -> tuple[Array, Array]:
+    """Colours (H, W, 3) of the clay and its smoothed depth (H, W)."""
+    smooth = _fill(clay.depth, clay.mask, sigma)
+    base = _fill(colours[clay.index], clay.mask, 0.7 * sigma)
+    shade = _lambert(camera, smooth, scale)
+    # What lies deeper than its surroundings gets less of the sky's light.
+    sunken = np.clip((_fill(clay.depth, clay.mask, 5.0 * sigma) - smooth) * scale / (6.0 * sigma), 0.0, 1.0)
+    light = (0.42 + 0.72 * shade) * (1.0 - 0.45 * sunken)
+    return np.clip(base * light[..., None], 0.0, 1.0), np.where(clay.mask, smooth, -np.inf)
+
+
+def _average(colour: Array, opacity: Array, quality: int) -> Array:
+    """Average blocks of samples into pixels (H, W, 4)."""
+    height, width = opacity.shape[0] // quality, opacity.shape[1] // quality
+    premultiplied = np.concatenate([colour * opacity[..., None], opacity[..., None]], axis=-1)
+    pixels = premultiplied.reshape(height, quality, width, quality, 4).mean(axis=(1, 3))
+    alpha = pixels[..., 3:]
+    plain = np.divide(pixels[..., :3], alpha, out=np.zeros_like(pixels[..., :3]), where=alpha > 0.0)
+    return np.concatenate([np.clip(plain, 0.0, 1.0), alpha], axis=-1)

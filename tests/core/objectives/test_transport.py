@@ -1,0 +1,159 @@
+"""The transport objective with a transparent solver: what it solves, when it starts warm, where gradients go."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from cpdeform.core.errors import InputError
+from cpdeform.core.objectives.contact import contact_loss
+from cpdeform.core.objectives.transport import ObjectiveTransport
+from cpdeform.core.ot import OTCapabilities, OTResult, OTSolver
+from cpdeform.core.scene import BodyBox, ManipulatorSphere, Scene
+from cpdeform.core.simulator import Trajectory
+from cpdeform.core.state import initial_state
+
+SCENE = Scene(
+    bodies=(BodyBox(position=(0.5, 0.4, 0.5), widths=(0.3, 0.3, 0.3), particle_count=12),),
+    manipulators=(ManipulatorSphere(position=(0.5, 0.7, 0.5), radius=0.05, action_scale=(0.01, 0.01, 0.01)),),
+)
+
+
+class OTSolverMean(OTSolver):
+    """Half the squared distance of the means; records its calls."""
+
+    capabilities = OTCapabilities("entropic", debiased=True, warm_start=True, devices=("cpu",), potential_tolerance=1.0)
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Tensor, Tensor, OTResult | None]] = []
+
+    def solve(
+        self,
+        source: Tensor,
+        target: Tensor,
+        *,
+        source_weights: Tensor | None = None,
+        target_weights: Tensor | None = None,
+        previous: OTResult | None = None,
+    ) -> OTResult:
+        self.calls.append((source, target, previous))
+        offset = source.mean(dim=0) - target.mean(dim=0)
+        gradient = (offset / source.shape[0]).expand_as(source)
+        potential = torch.zeros(source.shape[0])
+        return OTResult(0.5 * offset @ offset, potential, potential, gradient, True, 1, 0.0, 0.0)
+
+    @property
+    def warm(self) -> list[bool]:
+        return [previous is not None for _, _, previous in self.calls]
+
+
+def trajectory(worlds: int = 2) -> Trajectory:
+    state = initial_state(SCENE, batch_size=worlds, dtype=torch.float64)
+    noise = torch.randn(worlds, 4, 12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    positions = state.position.unsqueeze(1) + 0.02 * noise
+    poses = state.manipulator_pose.unsqueeze(1).repeat(1, 4, 1, 1)
+    return Trajectory(positions, poses, torch.zeros(worlds, 3, 3, dtype=torch.float64), state, state)
+
+
+def goal(count: int = 12) -> Tensor:
+    return torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+
+
+def test_value_and_gradient_of_the_last_step() -> None:
+    path = trajectory()
+    result = ObjectiveTransport(OTSolverMean(), goal()).evaluate(path)
+    positions = path.positions.clone().requires_grad_()
+    expected = 0.5 * ((positions[:, -1].mean(dim=1) - goal().mean(dim=0)) ** 2).sum(dim=1)
+    (gradient,) = torch.autograd.grad(expected.sum(), positions)
+    assert torch.allclose(result.loss, expected.detach())
+    assert torch.allclose(result.grad_positions, gradient)
+    assert result.grad_manipulators is None
+
+
+def test_contact_term_is_added_over_the_steps() -> None:
+    path, solver = trajectory(), OTSolverMean()
+    plain = ObjectiveTransport(solver, goal()).evaluate(path)
+    result = ObjectiveTransport(solver, goal(), contact_weight=3.0, scene=SCENE).evaluate(path)
+    positions, poses = path.positions.clone().requires_grad_(), path.manipulator_poses.clone().requires_grad_()
+    contact = 3.0 * contact_loss(SCENE, positions[:, 1:], poses[:, 1:]).sum(dim=1)
+    gradients = torch.autograd.grad(contact.sum(), [positions, poses])
+    assert torch.allclose(result.loss, plain.loss + contact.detach())
+    assert torch.allclose(result.grad_positions, plain.grad_positions + gradients[0])
+    assert result.grad_manipulators is not None
+    assert torch.allclose(result.grad_manipulators, gradients[1])
+    assert not path.positions.requires_grad
+
+
+def test_contact_term_of_a_scene_without_tools_is_zero() -> None:
+    bare = SCENE.model_copy(update={"manipulators": ()})
+    path = trajectory()
+    result = ObjectiveTransport(OTSolverMean(), goal(), contact_weight=3.0, scene=bare).evaluate(path)
+    assert torch.equal(result.loss, ObjectiveTransport(OTSolverMean(), goal()).evaluate(path).loss)
+
+
+def test_subset_is_fixed_shared_and_reproducible() -> None:
+    path, solver = trajectory(worlds=1), OTSolverMean()
+    target = path.positions[0, -1].clone()
+    objective = ObjectiveTransport(solver, target, points=5, seed=3)
+    result = objective.evaluate(path)
+    objective.evaluate(path)
+    ObjectiveTransport(solver, target, points=5, seed=3).evaluate(path)
+    ObjectiveTransport(solver, target, points=5, seed=4).evaluate(path)
+    sources = [source for source, _, _ in solver.calls]
+    assert sources[0].shape == (5, 3)
+    assert all(torch.equal(source, cloud) for source, cloud, _ in solver.calls)
+    assert torch.equal(sources[0], sources[1])
+    assert torch.equal(sources[0], sources[2])
+    assert not torch.equal(sources[0], sources[3])
+    assert float(result.loss[0]) == 0.0
+    moved = ObjectiveTransport(solver, target + 0.1, points=5, seed=3).evaluate(path)
+    assert int((moved.grad_positions[0, -1].norm(dim=-1) > 0).sum()) == 5
+
+
+def test_clouds_of_different_size_have_their_own_subsets() -> None:
+    solver = OTSolverMean()
+    ObjectiveTransport(solver, goal(30), points=20).evaluate(trajectory(worlds=1))
+    assert [tuple(cloud.shape) for cloud in solver.calls[0][:2]] == [(12, 3), (20, 3)]
+
+
+def test_warm_starts_refresh_and_reset() -> None:
+    path, solver = trajectory(worlds=1), OTSolverMean()
+    objective = ObjectiveTransport(solver, goal(), refresh=3)
+    for _ in range(5):
+        objective.evaluate(path)
+    objective.reset()
+    objective.evaluate(path)
+    assert solver.warm == [False, True, True, False, True, False]
+
+
+def test_every_world_starts_from_its_own_solution() -> None:
+    solver = OTSolverMean()
+    objective = ObjectiveTransport(solver, goal())
+    first = objective.evaluate(trajectory())
+    objective.evaluate(trajectory())
+    assert [float(call[2].value) for call in solver.calls[2:] if call[2] is not None] == first.loss.tolist()
+    objective.evaluate(trajectory(worlds=1))
+    assert solver.warm == [False, False, True, True, False]
+
+
+def test_without_warm_starts() -> None:
+    solver = OTSolverMean()
+    objective = ObjectiveTransport(solver, goal(), warm_start=False)
+    objective.evaluate(trajectory())
+    objective.evaluate(trajectory())
+    assert not any(solver.warm)
+
+
+def test_options_are_checked() -> None:
+    solver = OTSolverMean()
+    with pytest.raises(InputError, match="points: got 0"):
+        ObjectiveTransport(solver, goal(), points=0)
+    with pytest.raises(InputError, match="refresh: got 0"):
+        ObjectiveTransport(solver, goal(), refresh=0)
+    with pytest.raises(InputError, match="contact_weight: got nan"):
+        ObjectiveTransport(solver, goal(), contact_weight=float("nan"), scene=SCENE)
+    with pytest.raises(InputError, match="scene: got None"):
+        ObjectiveTransport(solver, goal(), contact_weight=1.0)
+    with pytest.raises(InputError, match="target: got shape"):
+        ObjectiveTransport(solver, torch.zeros(0, 3))
