@@ -146,7 +146,7 @@ def _evaluate(simulator: Simulator, state: State, actions: Tensor, objective: Ob
     marks.append(time.perf_counter())
     if not bool(finite.all()):
         # An objective cannot be asked about nan: worlds that broke are held at their start and reported as nan.
-        held = trajectory.positions[:, :1].expand_as(trajectory.positions)
+        held = state.position.unsqueeze(1).expand_as(trajectory.positions)
         positions = torch.where(finite[:, None, None, None], trajectory.positions, held)
         poses = trajectory.manipulator_poses.nan_to_num()
         result = objective.evaluate(dataclasses.replace(trajectory, positions=positions, manipulator_poses=poses))

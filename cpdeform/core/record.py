@@ -17,7 +17,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any
 
 import h5py
 from torch import Tensor
@@ -69,7 +69,6 @@ class RunRecorder(Observer):
         self._configuration = configuration
         self._overwrite = overwrite
         self._run: dict[str, Any] = {}
-        self._metrics: TextIO | None = None
         self._batch: dict[int, int] = {}
         check_directory(self.directory, overwrite=overwrite)
 
@@ -99,7 +98,7 @@ class RunRecorder(Observer):
             }
             with replacing(self.directory / TARGET_FILE) as temporary, h5py.File(temporary, "w") as file:
                 write_dataset(file, "position", target, shape="particle, xyz", units="length (domain edge = 1)")
-            self._metrics = (self.directory / METRICS_FILE).open("w", encoding="utf-8")
+            (self.directory / METRICS_FILE).write_text("", encoding="utf-8")
             self._write_run()
 
     def iteration_finished(self, stage: int, iteration: Iteration) -> None:
@@ -171,19 +170,14 @@ class RunRecorder(Observer):
         self._run.update(fields)
         with self._writing():
             self._write_run()
-            if self._metrics is not None:
-                self._metrics.close()
 
     def _write_run(self) -> None:
         write_json(self.directory / RUN_FILE, self._run)
 
     def _append(self, line: dict[str, Any]) -> None:
-        """Append a line to the metrics; flushed at once, so that it outlives this process."""
-        if self._metrics is None:
-            raise RecordError("RunRecorder: run_started must come first.")
-        with self._writing():
-            self._metrics.write(json.dumps(to_json(line), allow_nan=False) + "\n")
-            self._metrics.flush()
+        """Append a line to the metrics; the file is closed at once, so that the line outlives this process."""
+        with self._writing(), (self.directory / METRICS_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(to_json(line), allow_nan=False) + "\n")
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:

@@ -46,7 +46,7 @@ def own_files(directory: Path) -> list[Path]:
 
 
 def _is_own(name: str) -> bool:
-    plain = name[1:-4] if name.startswith(".") and name.endswith(".tmp") else name
+    plain = name[1:].replace(".tmp.", ".") if name.startswith(".") else name
     return plain in OWN_FILES or STAGE_PATTERN.fullmatch(plain) is not None
 
 
@@ -85,7 +85,7 @@ def _try_writing(directory: Path) -> None:
         for path in reversed(missing):
             path.mkdir()
             made.append(path)
-        probe = directory / f".{RUN_FILE}.tmp"
+        probe = directory / ".run.tmp.json"
         existed = probe.exists()
         with probe.open("ab"):
             pass
@@ -99,7 +99,7 @@ def _try_writing(directory: Path) -> None:
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary path beside `path`; what was written there takes the place of `path` at the end, in one step."""
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
         yield temporary
         with temporary.open("rb") as file:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.resources
 import zipfile
 import zlib
@@ -72,11 +71,10 @@ def load_target(path: Path, *, scene: Scene) -> NDArray[np.float64]:
     """
     argument = f"target file {path}"
     try:
-        with contextlib.ExitStack() as stack:
-            loaded = np.load(path, allow_pickle=False)
-            if isinstance(loaded, np.lib.npyio.NpzFile):
-                loaded = stack.enter_context(loaded)["position"]
-            values = np.asarray(loaded)
+        # Opened here, since numpy leaves the file open where it turns out to be a damaged archive.
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            values = np.asarray(loaded["position"] if isinstance(loaded, np.lib.npyio.NpzFile) else loaded)
     except FileNotFoundError as error:
         raise InputError(argument, came="no such file", expected="an .npz or .npy file of target particles") from error
     except KeyError as error:
@@ -147,6 +145,8 @@ def validate(model: type[Model], data: Any, *, source: str) -> Model:
             raise UnknownNameError(f"{source}: field {field}", str(name), _field_names(model, path)) from error
         came = repr(first["input"])
         message = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+        if message.startswith(("greater", "less")):
+            message = f"a value {message}"
         count = error.error_count() - 1
         more = f" ({count} more error{'s' if count > 1 else ''})" if count else ""
         raise InputError(

@@ -26,7 +26,6 @@ import torch
 from torch import Tensor
 
 from cpdeform.ot.divergence import Potentials, Problem, Side
-from cpdeform.ot.softmin import soft_minimum
 from cpdeform.ot.sparse import self_potential
 
 Descent = Callable[[Problem, Tensor, Tensor, float, int], tuple[Tensor, Tensor, int]]
@@ -120,11 +119,13 @@ def _subset(problem: Problem) -> Problem:
 
 def _extend(coarse: Problem, fine: Problem, potentials: Potentials) -> tuple[Tensor, Tensor]:
     """Debiased potentials of `coarse`, evaluated at the points of `fine` by the soft minima that define them."""
-    arguments = {"epsilon": coarse.epsilon, "exponent": coarse.exponent}
-    source, target = coarse.source, coarse.target
-    assert potentials.source_self is not None and potentials.target_self is not None  # `_ladder` always gives them
-    f = soft_minimum(fine.source.points, target.points, target.log_weights, potentials.target, **arguments)
-    f -= soft_minimum(fine.source.points, source.points, source.log_weights, potentials.source_self, **arguments)
-    g = soft_minimum(fine.target.points, source.points, source.log_weights, potentials.source, **arguments)
-    g -= soft_minimum(fine.target.points, target.points, target.log_weights, potentials.target_self, **arguments)
+    source_self, target_self = potentials.source_self, potentials.target_self
+    if source_self is None or target_self is None:
+        raise ValueError("extending debiased potentials needs the self-potentials")
+    to_source = dataclasses.replace(coarse, source=fine.source)
+    to_target = dataclasses.replace(coarse, source=fine.target)
+    f = to_source.source_update(potentials.target)
+    f -= dataclasses.replace(to_source, target=coarse.source).source_update(source_self)
+    g = dataclasses.replace(to_target, target=coarse.source).source_update(potentials.source)
+    g -= to_target.source_update(target_self)
     return f, g

@@ -53,7 +53,13 @@ class Problem:
 
     @classmethod
     def of(
-        cls, source: Tensor, target: Tensor, source_weights: Tensor | None, target_weights: Tensor | None, blur: float, exponent: int
+        cls,
+        source: Tensor,
+        target: Tensor,
+        source_weights: Tensor | None,
+        target_weights: Tensor | None,
+        blur: float,
+        exponent: int,
     ) -> Problem:
         """Check the arguments of `OTSolver.solve` and gather them."""
         first, second = check_problem(source, target, source_weights, target_weights)
@@ -72,6 +78,13 @@ class Problem:
         """Source potential (N,) from the target's (M,): half a Sinkhorn iteration."""
         side = self.target
         return soft_minimum(
+            self.source.points, side.points, side.log_weights, target_potential, epsilon=self.epsilon, exponent=self.exponent
+        )
+
+    def source_update_gradient(self, target_potential: Tensor) -> tuple[Tensor, Tensor]:
+        """`source_update`, and the gradient (N, 3) of each value with respect to its point."""
+        side = self.target
+        return soft_minimum_gradient(
             self.source.points, side.points, side.log_weights, target_potential, epsilon=self.epsilon, exponent=self.exponent
         )
 
@@ -181,21 +194,17 @@ def finish(problem: Problem, potentials: Potentials, *, blur: float, tolerance: 
     the normalised terms of the soft minimum its exact gradient. What the update changes is the source marginal's error.
     """
     source, target = problem.source, problem.target
-    arguments = {"epsilon": problem.epsilon, "exponent": problem.exponent}
-    updated, gradient = soft_minimum_gradient(
-        source.points, target.points, target.log_weights, potentials.target, epsilon=problem.epsilon, exponent=problem.exponent
-    )
+    updated, gradient = problem.source_update_gradient(potentials.target)
     error = problem.source_error(potentials.source, updated)
     potentials = dataclasses.replace(potentials, source=updated)
     source_potential, target_potential = updated, potentials.target
-    if potentials.source_self is not None and potentials.target_self is not None:
-        source_self, gradient_self = soft_minimum_gradient(
-            source.points, source.points, source.log_weights, potentials.source_self, **arguments
-        )
+    target_self = potentials.target_self
+    if potentials.source_self is not None and target_self is not None:
+        updated_self, gradient_self = problem.self_problem(source).source_update_gradient(potentials.source_self)
         gradient = gradient - gradient_self
-        potentials = dataclasses.replace(potentials, source_self=source_self)
-        source_potential = source_potential - source_self
-        target_potential = target_potential - potentials.target_self
+        potentials = dataclasses.replace(potentials, source_self=updated_self)
+        source_potential = source_potential - updated_self
+        target_potential = target_potential - target_self
     source_potential, target_potential = fix_gauge(source_potential, target_potential, source.weights)
     value = (source.weights * source_potential).sum() + (target.weights * target_potential).sum()
     return OTResult(

@@ -45,6 +45,11 @@ class OTSolverGeomLoss(OTSolver):
         iterations: Most iterations at one temperature.
         warm_iterations: Iterations of a warm call; more follow the moving cloud more closely.
 
+    Note:
+        A blur far below the point spacing leaves the potentials of points that touch only their own copies nearly free. The
+        marginals do not see them: every temperature gets 100 iterations at least, and a `scaling` nearer 1 helps. That, not
+        the marginals, sets `potential_tolerance`: 0.05 measured on a pen stroke, 0.002 between unrelated clouds.
+
     Raises:
         InputError: An option is out of range.
 
@@ -55,7 +60,7 @@ class OTSolverGeomLoss(OTSolver):
     """
 
     capabilities: ClassVar[OTCapabilities] = OTCapabilities(
-        potentials="entropic", debiased=True, warm_start=True, devices=("cpu", "cuda"), potential_tolerance=0.05
+        potentials="entropic", debiased=True, warm_start=True, devices=("cpu", "cuda"), potential_tolerance=0.1
     )
 
     def __init__(

@@ -50,6 +50,11 @@ class OTSolverPOT(OTSolver):
         iterations: Most iterations at one temperature.
         warm_iterations: Iterations of a warm call.
 
+    Note:
+        A blur far below the point spacing leaves the potentials of points that touch only their own copies nearly free. The
+        marginals hardly see them; a tighter `tolerance` and a `scaling` nearer 1 help. That, not the marginals,
+        sets `potential_tolerance`: 0.05-0.08 measured on a pen stroke, 0.003 between unrelated clouds.
+
     Raises:
         InputError: An option is out of range.
 
@@ -61,7 +66,7 @@ class OTSolverPOT(OTSolver):
     """
 
     capabilities: ClassVar[OTCapabilities] = OTCapabilities(
-        potentials="entropic", debiased=True, warm_start=True, devices=("cpu", "cuda"), potential_tolerance=0.05
+        potentials="entropic", debiased=True, warm_start=True, devices=("cpu", "cuda"), potential_tolerance=0.1
     )
 
     def __init__(
@@ -73,7 +78,7 @@ class OTSolverPOT(OTSolver):
         value: Literal["entropic", "exact"] = "entropic",
         method: Literal["sinkhorn_stabilized", "sinkhorn_log"] = "sinkhorn_stabilized",
         scaling: float = 0.5,
-        tolerance: float = 1e-3,
+        tolerance: float = 1e-4,
         iterations: int = 3000,
         warm_iterations: int = 1,
     ) -> None:
@@ -133,9 +138,7 @@ def _zeros(problem: Problem) -> tuple[Tensor, Tensor]:
     return torch.zeros_like(problem.source.weights), torch.zeros_like(problem.target.weights)
 
 
-def _sinkhorn(
-    problem: Problem, f: Tensor, g: Tensor, method: str, tolerance: float, limit: int
-) -> tuple[Tensor, Tensor, int]:
+def _sinkhorn(problem: Problem, f: Tensor, g: Tensor, method: str, tolerance: float, limit: int) -> tuple[Tensor, Tensor, int]:
     """Run `ot.sinkhorn` from the potentials f (N,), g (M,), the source's first.
 
     POT updates the second marginal's scaling first, so source and target change places. In the other direction equation (1)

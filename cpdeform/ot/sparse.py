@@ -32,6 +32,7 @@ _PAIR_LIMIT = 1 << 24  # pairs held sparsely; 256 MiB in float32 with the transp
 _DENSE_SMALL = 1 << 22  # pairs up to which selecting costs more than it saves
 _DENSE_LIMIT = 1 << 27  # pairs up to which a kernel that is not sparse is held densely; 512 MiB in float32
 _CHECK_EVERY = 10
+_LEAST = 100  # iterations on a kernel: the marginals settle long before the potentials of weakly linked points do
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +89,7 @@ def select_pairs(problem: Problem, source_potential: Tensor, target_potentials: 
 def _dense_kernel(problem: Problem, f: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
     source, target = problem.source.points, problem.target.points
     kernel = source.new_empty(source.shape[0], target.shape[0])
-    for rows in row_chunks(*kernel.shape, source.device):
+    for rows in row_chunks(source.shape[0], target.shape[0], source.device):
         exponents = pair_cost(source[rows], target, problem.exponent).neg_().add_(f[rows, None]).add_(g)
         kernel[rows] = scaled_exp_(exponents.div_(problem.epsilon).clamp_max_(80.0))
     return kernel, kernel.mT
@@ -104,9 +105,7 @@ def stabilised_kernel(problem: Problem, f: Tensor, targets: tuple[Tensor, Tensor
     return _dense_kernel(problem, f, targets[1]) if pairs <= _DENSE_LIMIT else None
 
 
-def _iterate(
-    problem: Problem, kernels: tuple[Tensor, Tensor], *, tolerance: float, limit: int
-) -> tuple[Tensor, Tensor, int]:
+def _iterate(problem: Problem, kernels: tuple[Tensor, Tensor], *, tolerance: float, limit: int) -> tuple[Tensor, Tensor, int]:
     """Iterate on fixed kernels until converged, out of iterations, or out of the selection's margin.
 
     Returns:
@@ -122,7 +121,7 @@ def _iterate(
         v = (transpose @ (a * u)).clamp_min_(smallest).reciprocal_()
         if count % _CHECK_EVERY == 0:
             error = float((a * (previous / u - 1).abs()).sum())
-            if error < tolerance or float(u.max() * v.max()) > math.exp(_MARGIN):
+            if (error < tolerance and count >= _LEAST) or float(u.max() * v.max()) > math.exp(_MARGIN):
                 break
     return u, v, count
 

@@ -25,7 +25,7 @@ class GridOptions:
 
     Attributes:
         grid_size: Positions along each axis of every grid.
-        refinements: Number of finer grids after the first; each spans one spacing of the grid before to either side.
+        refinements: Number of finer grids after the first; each spans the widest spacing of the grid before to either side.
         clearance: Least distance between the tool's surface and any particle or fixed tool, length units.
         margin: How far beyond touching the contact point the first grid reaches, length units; half of the tool's smallest
             half extent where absent.
@@ -153,11 +153,16 @@ class ToolGrid:
         positions = positions[(gaps >= self.options.clearance) & (gaps <= largest_gap)]
         positions = positions[self._gaps(positions, self._obstacles) >= self.options.clearance]
         # The other tools' surfaces were obstacles above; a tool that is wholly inside another shows only the other way round.
-        surface = rotate(self.quaternion, self._surface)
         for tool, pose in self._fixed:
-            gap = signed_distance(tool, pose, surface + positions.unsqueeze(1)).amin(dim=-1)
-            positions = positions[gap >= self.options.clearance]
+            positions = positions[self._gaps_to_tool(positions, tool, pose) >= self.options.clearance]
         return positions
+
+    def _gaps_to_tool(self, positions: Tensor, other: Manipulator, pose: Tensor) -> Tensor:
+        """Least distance (G,) of this tool's surface to another tool, negative where it reaches inside."""
+        surface = rotate(self.quaternion, self._surface)
+        step = max(1, CHUNK_DISTANCES // surface.shape[0])
+        chunks = torch.split(positions, step)
+        return torch.cat([signed_distance(other, pose, surface + chunk.unsqueeze(1)).amin(dim=-1) for chunk in chunks])
 
     def _gaps(self, positions: Tensor, points: Tensor, reach: float = 0.0) -> Tensor:
         """Distance (G,) between the tool and the nearest of the points (P, 3); exact up to `reach` or the clearance."""
@@ -185,15 +190,16 @@ class ToolGrid:
         half = self.half_extents + margin + self.options.clearance
         center, best = contact, None
         for _ in range(self.options.refinements + 1):
-            spacing = 2.0 * half / (self.options.grid_size - 1)
+            spacing = 2.0 * float(half.max()) / (self.options.grid_size - 1)
             positions = _grid(center, half, self.options.grid_size)
             if best is not None:
                 positions = torch.cat([best.position.unsqueeze(0), positions])
-            positions = self.feasible(positions, largest_gap=self._largest_gap(float(spacing.min())))
+            positions = self.feasible(positions, largest_gap=self._largest_gap(spacing))
             if not positions.shape[0]:
                 return None
             best = self._pick(positions, cost(positions), contact, tolerance)
-            center, half = best.position, spacing
+            # A cube, for the next grid has to reach as far along every axis as a gap that this one allowed.
+            center, half = best.position, torch.full_like(half, spacing)
         return best
 
     def _largest_gap(self, spacing: float) -> float:

@@ -40,14 +40,15 @@ def draw_animation(record: RunRecord) -> Path | None:
     pictures += [pictures[-1]] * round(HOLD_SECONDS * FRAMES_PER_SECOND)
     path = record.directory / ("animation.mp4" if _has_ffmpeg() else "animation.gif")
     if path.suffix == ".mp4":
-        # The container is named, since it cannot be told from the name of the temporary file.
-        options: dict[str, Any] = {"fps": FRAMES_PER_SECOND, "codec": "libx264", "quality": 8, "output_params": ["-f", "mp4"]}
+        options: dict[str, Any] = {"fps": FRAMES_PER_SECOND, "codec": "libx264", "quality": 8}
         form = "FFMPEG"
     else:
         options, form = {"duration": 1000.0 / FRAMES_PER_SECOND, "loop": 0}, "GIF"
-    with replacing(path) as temporary, imageio.v2.get_writer(str(temporary), format=form, mode="I", **options) as writer:
-        for picture in pictures:
-            writer.append_data(picture)
+    with replacing(path) as temporary:
+        writer: Any = imageio.v2.get_writer(str(temporary), format=form, mode="I", **options)
+        with writer:
+            for picture in pictures:
+                writer.append_data(picture)
     return path
 
 
@@ -68,7 +69,7 @@ def _draw_frames(record: RunRecord, view: View, frames: list[tuple[int, int]]) -
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.2, 6.4), dpi=100, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
+    canvas: Any = FigureCanvasAgg(figure)
     for number, step in frames:
         stage = record.stages[number]
         if stage.positions is None or stage.manipulator_poses is None:
@@ -87,7 +88,7 @@ def _draw_frames(record: RunRecord, view: View, frames: list[tuple[int, int]]) -
 def _has_ffmpeg() -> bool:
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         return False
-    import imageio_ffmpeg
+    import imageio_ffmpeg  # type: ignore[import-untyped]
 
     try:
         imageio_ffmpeg.get_ffmpeg_exe()

@@ -135,12 +135,12 @@ def clay_colours(view: View, positions: Array) -> Array:
     return np.asarray(LinearSegmentedColormap.from_list("clay", CLAY)(height)[:, :3])
 
 
-def draw_scene(axis: Any, view: View, particles: Array, colours: Array, tools: list[Array], *, width: int, quality: int = 2) -> None:
+def draw_scene(
+    axis: Any, view: View, particles: Array, colours: Array, tools: list[Array], *, width: int, quality: int = 2
+) -> None:
     """Draw particles and tools on the floor into a matplotlib axis."""
     camera = view.camera
-    picture = render(
-        camera, width=width, particles=particles, colours=colours, radius=view.radius, tools=tools, quality=quality
-    )
+    picture = render(camera, width=width, particles=particles, colours=colours, radius=view.radius, tools=tools, quality=quality)
     floor = camera.project(view.floor)
     axis.fill(floor[:, 0], floor[:, 1], facecolor="#f1f0ec", edgecolor="#b9b6ad", linewidth=0.8, zorder=0)
     half_width, half_height = camera.half_width, camera.half_height

@@ -125,22 +125,23 @@ def _draw_points(camera: Camera, shape: tuple[int, int], points: Array, radius: 
     column = np.floor((seen[:, 0] + camera.half_width) * scale).astype(np.int64)
     row = np.floor((camera.half_height - seen[:, 1]) * scale).astype(np.int64)
     low, span = float(seen[:, 2].min()) - radius, float(np.ptp(seen[:, 2])) + 3.0 * radius
+    reach = int(np.ceil(radius * scale))
     # Depth and index share one integer, depth in front: the largest is the nearest ball and tells which one it is.
     unit = float(2**36) / span
-    buffer = np.full(height * width, -1, dtype=np.int64)
-    reach = int(np.ceil(radius * scale))
-    number = np.arange(len(points))
+    buffer = np.full((height + 2 * reach) * (width + 2 * reach), -1, dtype=np.int64)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    number = np.flatnonzero(inside)
+    # A border as wide as a ball's radius saves a test at each pixel.
+    place = ((row + reach) * (width + 2 * reach) + column + reach)[inside]
+    near = seen[inside, 2] - low
     for down in range(-reach, reach + 1):
         for right in range(-reach, reach + 1):
             bulge = radius**2 - (down**2 + right**2) / scale**2
             if bulge < 0.0:
                 continue
-            x, y = column + right, row + down
-            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            near = ((seen[:, 2] + np.sqrt(bulge) - low) * unit).astype(np.int64)
-            key = (near << INDEX_BITS) | number
-            np.maximum.at(buffer, (y * width + x)[inside], key[inside])
-    buffer = buffer.reshape(shape)
+            key = (((near + np.sqrt(bulge)) * unit).astype(np.int64) << INDEX_BITS) | number
+            np.maximum.at(buffer, place + down * (width + 2 * reach) + right, key)
+    buffer = buffer.reshape(height + 2 * reach, width + 2 * reach)[reach : reach + height, reach : reach + width]
     mask = buffer >= 0
     depth = np.where(mask, (buffer >> INDEX_BITS) / unit + low, -np.inf)
     return _Layer(depth, np.where(mask, buffer & (2**INDEX_BITS - 1), 0), mask)
@@ -148,14 +149,22 @@ def _draw_points(camera: Camera, shape: tuple[int, int], points: Array, radius: 
 
 def _fill(values: Array, mask: NDArray[np.bool_], sigma: float) -> Array:
     """Smooth values (H, W) or (H, W, K) over the mask with a Gaussian of `sigma` samples; beyond it they are continued."""
-    from scipy.ndimage import gaussian_filter
+    from scipy.ndimage import gaussian_filter, zoom
 
-    sigmas = (sigma, sigma, 0.0)[: values.ndim]
-    weight = gaussian_filter(mask.astype(np.float64), sigma)
-    inside = mask if values.ndim == 2 else mask[..., None]
-    total = gaussian_filter(np.where(inside, values, 0.0), sigmas)
-    divisor = np.maximum(weight, 1e-9)
-    return np.asarray(total / (divisor if values.ndim == 2 else divisor[..., None]))
+    channels = values[..., None] if values.ndim == 2 else values
+    stack = np.concatenate([np.where(mask[..., None], channels, 0.0), mask[..., None]], axis=-1).astype(np.float32)
+    # A wide Gaussian is as good on a coarser grid, and its cost grows with its width in samples.
+    coarse = max(int(sigma / 3.0), 1)
+    height, width = mask.shape
+    if coarse > 1:
+        padded = np.pad(stack, ((0, -height % coarse), (0, -width % coarse), (0, 0)))
+        rows, columns = padded.shape[0] // coarse, padded.shape[1] // coarse
+        stack = padded.reshape(rows, coarse, columns, coarse, -1).mean(axis=(1, 3))
+    blurred = gaussian_filter(stack, (sigma / coarse, sigma / coarse, 0.0))
+    filled = blurred[..., :-1] / np.maximum(blurred[..., -1:], 1e-6)
+    if coarse > 1:
+        filled = zoom(filled, (coarse, coarse, 1), order=1, mode="nearest", grid_mode=True)[:height, :width]
+    return np.asarray(filled.reshape(values.shape), dtype=np.float64)
 
 
 def _lambert(camera: Camera, depth: Array, scale: float) -> Array:
@@ -164,7 +173,7 @@ def _lambert(camera: Camera, depth: Array, scale: float) -> Array:
     normal = np.stack([-right, down, np.ones_like(depth)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     light = camera.axes @ (LIGHT / np.linalg.norm(LIGHT))
-    return np.clip(normal @ light, 0.0, 1.0)
+    return np.asarray(np.clip(normal @ light, 0.0, 1.0))
 
 
 def _shade_clay(camera: Camera, clay: _Layer, colours: Array, sigma: float, scale: float) -> tuple[Array, Array]:

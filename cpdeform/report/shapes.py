@@ -61,7 +61,7 @@ def _profile(manipulator: Manipulator, rows: int) -> Array:
         case ManipulatorTorus():
             angle = np.linspace(0.0, 2.0 * np.pi, 4 * rows)
             ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) * manipulator.tube_radius
-            corners = ring + [manipulator.major_radius, 0.0]
+            corners = ring + np.array([manipulator.major_radius, 0.0])
         case _:
             raise InputError("manipulator", came=type(manipulator).__name__, expected="a manipulator of cpdeform.core.scene")
     # Even spacing along the curve keeps the cells of the mesh of about one size.
@@ -88,9 +88,7 @@ def _box(box: ManipulatorBox, rows: int, columns: int) -> Array:
     row_sign = np.repeat([-1.0, 1.0], 6)[:, None]
     x_sign, z_sign = np.repeat([1.0, -1.0, -1.0, 1.0], 6), np.repeat([1.0, 1.0, -1.0, -1.0], 6)
     cos_latitude, sin_latitude = np.cos(latitude)[:, None], np.sin(latitude)[:, None]
-    normal = np.stack(
-        [cos_latitude * np.cos(longitude), sin_latitude + 0.0 * longitude, cos_latitude * np.sin(longitude)], axis=-1
-    )
+    normal = np.stack([cos_latitude * np.cos(longitude), sin_latitude + 0.0 * longitude, cos_latitude * np.sin(longitude)], axis=-1)
     corner = np.stack([x_sign + 0.0 * row_sign, row_sign + 0.0 * x_sign, z_sign + 0.0 * row_sign], axis=-1)
     points = corner * np.asarray(box.half_extents) + box.rounding * normal
     points = np.concatenate([points, points[:, :1]], axis=1)
@@ -113,4 +111,4 @@ def _densify(points: Array, count: int, *, axis: int) -> Array:
     new = np.concatenate([*(np.arange(n) / n + i for i, n in enumerate(extra)), old[-1:]])
     lower = np.minimum(new.astype(int), len(old) - 2)
     weight = (new - lower)[:, None, None] if axis == 0 else (new - lower)[None, :, None]
-    return (1.0 - weight) * np.take(points, lower, axis=axis) + weight * np.take(points, lower + 1, axis=axis)
+    return np.asarray((1.0 - weight) * np.take(points, lower, axis=axis) + weight * np.take(points, lower + 1, axis=axis))

@@ -40,7 +40,7 @@ def random_weights(count: int, seed: int) -> Tensor:
 
 
 def exact_cost(source: Tensor, target: Tensor, exponent: int = 1) -> float:
-    cost = torch.cdist(source, target).pow(exponent).numpy()
+    cost = (source[:, None] - target).norm(dim=2).pow(exponent).numpy()
     uniform = [torch.full((len(points),), 1 / len(points), dtype=torch.float64).numpy() for points in (source, target)]
     return float(ot.emd2(*uniform, cost))
 
@@ -57,11 +57,12 @@ def value_of(result: OTResult, source_weights: Tensor, target_weights: Tensor) -
 
 
 def test_translation_by_more_than_its_size_costs_its_length(make: MakeSolver) -> None:
-    # Then moving every point by the same vector is optimal, and so is no other direction of the gradient.
-    source = 0.02 * torch.rand(120, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    # The entropic costs exceed the exact ones by eps log N at most, so the divergence is that close to the exact cost.
+    axis = torch.linspace(0, 0.02, 5, dtype=torch.float64)
+    source = torch.cartesian_prod(axis, axis, axis)[:120]
     shift = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-    result = make(blur=1e-3, exponent=1).solve(source, source + shift)
-    assert float(result.value) == pytest.approx(1.0, rel=2e-3)
+    result = make(blur=4e-4).solve(source, source + shift)
+    assert float(result.value) == pytest.approx(1.0, abs=4e-4 * math.log(120))
     assert result.converged
     direction = -shift.expand(120, 3) / 120
     assert torch.allclose(result.source_gradient, direction, atol=0.03 / 120)
@@ -79,10 +80,10 @@ def test_two_weighted_points_ship_the_surplus(make: MakeSolver) -> None:
     # Weight 0.7 and 0.3 against 0.4 and 0.6 on the same two points: 0.3 moves over the distance 0.5.
     points = torch.tensor([[0.0, 0.0, 0.0], [0.3, 0.0, 0.4]], dtype=torch.float64)
     first, second = torch.tensor([0.7, 0.3], dtype=torch.float64), torch.tensor([0.4, 0.6], dtype=torch.float64)
-    result = make(blur=1e-2).solve(points, points, source_weights=first, target_weights=second)
-    assert float(result.value) == pytest.approx(0.15, rel=0.02)
+    result = make(blur=1e-3).solve(points, points, source_weights=first, target_weights=second)
+    assert float(result.value) == pytest.approx(0.15, rel=0.005)
     difference = float(result.source_potential[0] - result.source_potential[1])
-    assert difference == pytest.approx(0.5, rel=0.05)  # the price of moving from the first to the second point
+    assert difference == pytest.approx(0.5, rel=0.005)  # the price of moving from the first to the second point
 
 
 def test_points_on_a_line_are_matched_in_order(make: MakeSolver) -> None:
@@ -91,13 +92,13 @@ def test_points_on_a_line_are_matched_in_order(make: MakeSolver) -> None:
     source[:, 0] = torch.rand(80, generator=generator, dtype=torch.float64)
     target[:, 0] = 0.4 + 0.5 * torch.rand(80, generator=generator, dtype=torch.float64)
     expected = float((source[:, 0].sort().values - target[:, 0].sort().values).abs().mean())
-    assert float(make(blur=1e-3).solve(source, target).value) == pytest.approx(expected, rel=0.01)
+    assert float(make(blur=3e-4).solve(source, target).value) == pytest.approx(expected, rel=0.01)
 
 
 @pytest.mark.parametrize("exponent", [1, 2])
 def test_small_blur_agrees_with_the_exact_cost(make: MakeSolver, exponent: int) -> None:
-    source, target = cloud(200, seed=3), cloud(240, seed=4) * torch.tensor([1.0, 1.5, 0.9])
-    result = make(blur=1e-3 if exponent == 1 else 1e-2, exponent=exponent).solve(source, target)
+    source, target = cloud(200, seed=3), cloud(200, seed=4) * torch.tensor([1.0, 1.5, 0.9])
+    result = make(blur=5e-4 if exponent == 1 else 3e-3, exponent=exponent).solve(source, target)
     assert float(result.value) == pytest.approx(exact_cost(source, target, exponent), rel=0.01)
 
 
@@ -169,7 +170,9 @@ def test_value_is_the_dual_value_and_the_gauge_holds(make: MakeSolver, debias: b
     assert float(weighted_median(result.source_potential, first)) == pytest.approx(0, abs=1e-12)
     assert solver.capabilities.debiased is debias
     assert solver.capabilities.potentials == "entropic"
-    assert result.converged and result.marginal_error <= 1e-3 and result.blur == 3e-3
+    assert result.converged
+    assert result.marginal_error <= 1e-3
+    assert result.blur == 3e-3
 
 
 @pytest.mark.parametrize("exponent", [1, 2])
@@ -204,8 +207,8 @@ def test_results_carry_no_graph_and_leave_gradients_as_they_were(make: MakeSolve
 
 @pytest.mark.parametrize("changed", ["stroke", "random"])
 def test_pot_and_geomloss_agree(changed: str) -> None:
-    source = cloud(500, seed=21)
-    target = pressed(source) if changed == "stroke" else cloud(500, seed=22) * torch.tensor([1.0, 0.8, 1.0]) + 0.01
+    source = cloud(300, seed=21)
+    target = pressed(source) if changed == "stroke" else cloud(300, seed=22) * torch.tensor([1.0, 0.8, 1.0]) + 0.01
     first, second = (SOLVERS[name](blur=1e-3).solve(source, target) for name in ("pot", "geomloss"))
     assert float(first.value) == pytest.approx(float(second.value), rel=0.005)
     assert cosine(first.source_gradient, second.source_gradient) > 0.995
@@ -214,10 +217,12 @@ def test_pot_and_geomloss_agree(changed: str) -> None:
     assert float((first.source_potential - second.source_potential).abs().max()) < tolerance * spread
 
 
-def test_potentials_are_those_of_the_tightly_converged_problem(make: MakeSolver) -> None:
-    source, target = cloud(300, seed=23), cloud(300, seed=24) + 0.02
+@pytest.mark.parametrize("changed", ["stroke", "random"])
+def test_potentials_are_those_of_the_tightly_converged_problem(make: MakeSolver, changed: str) -> None:
+    source = cloud(200, seed=23)
+    target = pressed(source) if changed == "stroke" else cloud(200, seed=24) + 0.02
     usual = make(blur=2e-3).solve(source, target)
-    tight = make(blur=2e-3, scaling=0.8, tolerance=1e-7, iterations=20000).solve(source, target)
+    tight = make(blur=2e-3, scaling=0.8, tolerance=1e-6, iterations=10000).solve(source, target)
     spread = float(tight.source_potential.max() - tight.source_potential.min())
     difference = float((usual.source_potential - tight.source_potential).abs().max())
     assert difference < make().capabilities.potential_tolerance * spread
@@ -227,15 +232,15 @@ def test_potentials_are_those_of_the_tightly_converged_problem(make: MakeSolver)
 
 
 def test_warm_call_is_close_to_converged_and_cheap(make: MakeSolver) -> None:
-    source, target = cloud(700, seed=25, dtype=torch.float32), cloud(700, seed=26, dtype=torch.float32) + 0.02
-    noise = torch.randn(700, 3, generator=torch.Generator().manual_seed(1)) * (1e-3 / math.sqrt(3))
+    source, target = cloud(400, seed=25, dtype=torch.float32), cloud(400, seed=26, dtype=torch.float32) + 0.02
+    noise = torch.randn(400, 3, generator=torch.Generator().manual_seed(1)) * (1e-3 / math.sqrt(3))
     solver = make(blur=1e-3)
     start = solver.solve(source, target)
     warm, cold = solver.solve(source + noise, target, previous=start), solver.solve(source + noise, target)
     assert float(warm.value) == pytest.approx(float(cold.value), rel=0.01)
     assert cosine(warm.source_gradient, cold.source_gradient) > 0.97
     assert warm.iterations == 1 < cold.iterations
-    weights = torch.full((700,), 1 / 700)
+    weights = torch.full((400,), 1 / 400)
     assert value_of(warm, weights, weights) == pytest.approx(float(warm.value), abs=1e-6)
 
 
@@ -280,9 +285,8 @@ def pressed(points: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("blur", [1e-3, 5e-3])
-@pytest.mark.parametrize("count", [1500, 2400])
-def test_priorities_point_at_the_pen_stroke(make: MakeSolver, blur: float, count: int) -> None:
-    source = cloud(count, seed=30)
+def test_priorities_point_at_the_pen_stroke(make: MakeSolver, blur: float) -> None:
+    source = cloud(1500, seed=30)
     result = make(blur=blur).solve(source.float(), pressed(source).float())
     distance = stroke_offset(source).norm(dim=1)
     peak = float(result.source_potential.max())
@@ -320,7 +324,9 @@ def test_exact_value_with_entropic_potentials() -> None:
 
 def test_logarithmic_method_of_pot_gives_the_same() -> None:
     source, target = cloud(120, seed=32), cloud(120, seed=33) + 0.02
-    first, second = (OTSolverPOT(blur=3e-3, method=method).solve(source, target) for method in ("sinkhorn_log", "sinkhorn_stabilized"))
+    first, second = (
+        OTSolverPOT(blur=3e-3, method=method).solve(source, target) for method in ("sinkhorn_log", "sinkhorn_stabilized")
+    )
     assert float(first.value) == pytest.approx(float(second.value), rel=1e-3)
     assert cosine(first.source_gradient, second.source_gradient) > 0.999
 
@@ -334,8 +340,10 @@ def test_paper_settings_reproduce_geomloss() -> None:
     value.backward()
     result = OTSolverGeomLoss(settings="paper").solve(source, target)
     assert float(result.value) == pytest.approx(float(value.detach()), rel=1e-5)
-    assert points.grad is not None and torch.allclose(result.source_gradient, points.grad, atol=1e-7)
-    assert not result.converged and not math.isfinite(result.marginal_error)
+    assert points.grad is not None
+    assert torch.allclose(result.source_gradient, points.grad, atol=1e-7)
+    assert not result.converged
+    assert not math.isfinite(result.marginal_error)
 
 
 # Errors -------------------------------------------------------------------------------------------------------------------

@@ -67,7 +67,8 @@ class ObjectivePlasticineLab(ObjectiveAutograd):
         density_weight: Weight of the density term, 1/mass.
         sdf_weight: Weight of the distance term, 1/(mass length).
         contact_weight: Weight of the contact term, 1/length^2.
-        contact: ``"hard"`` (nearest particle) or ``"soft"`` (weighted mean); PlasticineLab's own default is hard.
+        contact: ``"plasticinelab"`` (nearest particle, with the gradient PlasticineLab computes; its default), ``"hard"``
+            (nearest particle, with its true gradient) or ``"soft"`` (weighted mean); see `contact_loss`.
 
     Raises:
         InputError: The grid does not fit the scene or holds no target, a weight is negative, or `contact` is unknown.
@@ -84,7 +85,7 @@ class ObjectivePlasticineLab(ObjectiveAutograd):
         density_weight: float = 10.0,
         sdf_weight: float = 10.0,
         contact_weight: float = 1.0,
-        contact: ContactKind = "hard",
+        contact: ContactKind = "plasticinelab",
     ) -> None:
         check_contact_kind(contact)
         weights = {"density_weight": density_weight, "sdf_weight": sdf_weight, "contact_weight": contact_weight}

@@ -1,0 +1,76 @@
+"""The command `cpdeform`."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from typing import Annotated, Any, TextIO
+
+import typer
+from typer.core import TyperGroup
+
+from cpdeform import __version__
+from cpdeform.cli.plugins import plugins
+from cpdeform.cli.run import run
+from cpdeform.cli.tasks import tasks
+from cpdeform.core.errors import CpdeformError
+
+
+class ErrorGroup(TyperGroup):
+    """Commands whose deliberate errors are one message on stderr and exit code 2; anything else is a bug and keeps its trace."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the chosen command."""
+        try:
+            with warnings.catch_warnings():
+                warnings.showwarning = _show_warning
+                return super().invoke(ctx)
+        except CpdeformError as error:
+            typer.echo(f"cpdeform: error: {error}", err=True)
+            raise typer.Exit(2) from error
+        except KeyboardInterrupt as error:
+            typer.echo("cpdeform: interrupted", err=True)
+            raise typer.Exit(130) from error
+
+
+def _show_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None, line: str | None = None
+) -> None:
+    """Show a warning as a line of text, without the place in the source."""
+    typer.echo(f"cpdeform: warning: {message}", file=file or sys.stderr)
+
+
+app = typer.Typer(
+    cls=ErrorGroup,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command()(run)
+app.command()(tasks)
+app.command()(plugins)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"cpdeform {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def callback(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Plan how robot tools sculpt soft, clay-like bodies."""
+
+
+def main() -> None:
+    """Entry point of the command line; exits with 0, 1 (a run without result), 2 (unusable input) or 130 (interrupted)."""
+    app(prog_name="cpdeform")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,204 @@
+"""`cpdeform run`: a task to a plan, with its record and pictures."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from cpdeform.core.configuration import RunConfiguration
+    from cpdeform.core.plugins import Registry
+    from cpdeform.core.record import RunRecorder
+    from cpdeform.core.result import DeformResult, Observer
+
+FLAGS = {
+    "task": "TASK",
+    "backend": "--backend",
+    "ot": "--ot",
+    "placer": "--placer",
+    "device": "--device",
+    "seed": "--seed",
+    "stages": "--stages",
+    "optimizer.iterations": "--iterations",
+}
+"""Flag of each field of the configuration that has one, for messages."""
+
+SOURCE = "--set"
+
+
+def run(
+    task: Annotated[str | None, typer.Argument(help="Name, e.g. writer-v2, or a YAML file.  [default: writer]")] = None,
+    backend: Annotated[str | None, typer.Option(help="Simulator.  [default: warp]", metavar="NAME")] = None,
+    ot: Annotated[str | None, typer.Option(help="Optimal-transport solver.  [default: geomloss]", metavar="NAME")] = None,
+    placer: Annotated[str | None, typer.Option(help="Where tools are put.  [default: transport]", metavar="NAME")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda.  [default: cpu]", metavar="NAME")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of first actions and random placements.  [default: 0]")] = None,
+    stages: Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")] = None,
+    iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: 40]")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Any other option, e.g. optimizer.learning_rate=0.05; repeatable.", metavar="KEY=VALUE"),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Directory of the run record.  [default: runs/<task>-<time>]", metavar="DIR")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run record in --out.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line, no progress.")] = False,
+    no_pictures: Annotated[bool, typer.Option("--no-pictures", help="Draw no picture and no animation.")] = False,
+) -> None:
+    """Plan how the tools of a task turn its body into its goal, and record the run.
+
+    Exit code 0: a plan was found; 1: none was (the advice says what to try); 2: unusable input; 130: interrupted.
+    """
+    flags = (task, backend, ot, placer, device, seed, stages, iterations)
+    given = {field: value for field, value in zip(FLAGS, flags, strict=True) if value is not None}
+    configuration = _configure(given, settings or [])
+    from cpdeform.core.plugins import load_registry
+
+    registry = load_registry()
+    with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+        # Libraries print to stdout, too; a reader of the JSON must not see that.
+        result, directory = _execute(configuration, registry, out, overwrite=overwrite, silent=as_json)
+        picture = None if no_pictures else _draw(directory)
+    if as_json:
+        typer.echo(json.dumps(_summary(result, configuration, directory)))
+    else:
+        _print_summary(result, directory, picture)
+    if not _finished(result):
+        raise typer.Exit(1)
+
+
+def _configure(given: dict[str, Any], settings: list[str]) -> RunConfiguration:
+    """Build the configuration of ``--set`` and, above it, the flags given."""
+    from cpdeform.core.configuration import RunConfiguration
+    from cpdeform.core.errors import InputError
+    from cpdeform.core.plugins import split_options
+    from cpdeform.core.task import merge, validate
+
+    values = split_options(settings)
+    for field, value in given.items():
+        group, dot, name = field.rpartition(".")
+        if dot and not isinstance(values.get(group, {}), dict):
+            continue
+        values = merge(values, {group: {name: value}} if dot else {field: value})
+    try:
+        return validate(RunConfiguration, values, source=SOURCE)
+    except InputError as error:
+        field = error.argument.removeprefix(f"{SOURCE}: ")
+        if field in given:
+            raise InputError(FLAGS[field], came=error.came, expected=error.expected, remedy=error.remedy) from error
+        raise
+
+
+def _execute(
+    configuration: RunConfiguration, registry: Registry, out: Path | None, *, overwrite: bool, silent: bool
+) -> tuple[DeformResult, Path]:
+    """Run with record and progress; the cheap checks come first, and nothing is written before all are passed."""
+    from cpdeform.core.deform import check_names, configured_task, deform_configuration
+    from cpdeform.core.record import RunRecorder
+
+    check_names(configuration, registry=registry)
+    task = configured_task(configuration, registry=registry)
+    task.load_target()
+    recorder = RunRecorder(out or _default_directory(task.name), configuration=configuration, overwrite=overwrite)
+    try:
+        with recorder, _progress(configuration.stages, silent=silent) as observers:
+            result = deform_configuration(configuration, observers=[recorder, *observers], registry=registry)
+    except KeyboardInterrupt as error:
+        typer.echo(_interruption(recorder), err=True)
+        raise typer.Exit(130) from error
+    return result, recorder.directory
+
+
+def _interruption(recorder: RunRecorder) -> str:
+    if not recorder.started:
+        return "cpdeform: interrupted before the run began; nothing was written"
+    return f"cpdeform: interrupted; the finished stages are recorded in {recorder.directory}"
+
+
+def _default_directory(task: str) -> Path:
+    """A directory under ``runs`` that does not exist yet."""
+    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    first = Path("runs") / f"{task}-{stamp}"
+    path, number = first, 1
+    while path.exists():
+        number += 1
+        path = first.with_name(f"{first.name}-{number}")
+    return path
+
+
+@contextlib.contextmanager
+def _progress(stages: int | None, *, silent: bool) -> Iterator[list[Observer]]:
+    """Observers that show the progress: none, a bar on a terminal, else lines."""
+    from cpdeform.cli.progress import ProgressBar, ProgressLines
+
+    if silent:
+        yield []
+    elif sys.stderr.isatty():
+        with ProgressBar(stages=stages) as bar:
+            yield [bar]
+    else:
+        yield [ProgressLines()]
+
+
+def _draw(directory: Path) -> Path | None:
+    """Draw the pictures; the run is recorded, so that whatever goes wrong here is told and does not fail the command."""
+    try:
+        from cpdeform.report import draw_run
+
+        return draw_run(directory)
+    except ModuleNotFoundError as error:
+        typer.echo(f'cpdeform: no pictures: {error.name} is missing; pip install "cpdeform[report]"', err=True)
+    except Exception as error:
+        typer.echo(f"cpdeform: no pictures: {type(error).__name__}: {error}", err=True)
+    return None
+
+
+def _finished(result: DeformResult) -> int:
+    """Number of stages whose plan was executed."""
+    return sum(stage.actions is not None for stage in result.stages)
+
+
+def _summary(result: DeformResult, configuration: RunConfiguration, directory: Path) -> dict[str, Any]:
+    from cpdeform.core.record_files import to_json
+
+    summary = {
+        "task": result.task.name,
+        "backend": configuration.backend,
+        "ot": configuration.ot,
+        "placer": configuration.placer,
+        "seed": result.seed,
+        "status": result.status.value,
+        "advice": result.status.advice,
+        "loss_initial": result.loss_initial,
+        "loss_final": result.loss_final,
+        "metric": result.metric_name,
+        "metric_value": result.metric_value,
+        "stages": _finished(result),
+        "gradient_evaluations": result.gradient_evaluations,
+        "seconds": result.seconds,
+        "out": str(directory),
+    }
+    return {key: to_json(value) for key, value in summary.items()}
+
+
+def _print_summary(result: DeformResult, directory: Path, picture: Path | None) -> None:
+    lines = [
+        f"{result.task.name}: {result.status.value.replace('_', ' ')}",
+        f"  loss     {result.loss_initial:.4g} -> {result.loss_final:.4g}",
+        f"  metric   {result.metric_name.replace('_', ' ')} {result.metric_value:.4g}",
+        f"  effort   {_finished(result)} stages, {result.gradient_evaluations} gradient evaluations, {result.seconds:.1f} s",
+        f"  record   {directory}",
+    ]
+    if picture is not None:
+        lines.append(f"  picture  {picture}")
+    if result.status.advice:
+        lines.append(f"  advice   {result.status.advice}")
+    typer.echo("\n".join(lines))

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from cpdeform.core.sampling import body_index, sample_particles
+from cpdeform.core.scene import BodyBox, BodySphere, ManipulatorBox, ManipulatorCapsule, Material, Scene
+from cpdeform.core.state import initial_state
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+BALL = {"kind": "sphere", "position": (0.5, 0.5, 0.5), "radius": 0.1, "particle_count": 500}
+BLOCK = {"kind": "box", "position": (0.3, 0.2, 0.3), "widths": (0.1, 0.2, 0.3), "particle_count": 300}
+PEN = {"kind": "Capsule", "position": (0.5, 0.8, 0.5), "radius": 0.03, "height": 0.1, "action_scale": (0.01, 0.01, 0.01)}
+
+
+def test_material_constants():
+    material = Material(youngs_modulus=5000.0, poisson_ratio=0.2)
+    assert material.shear_modulus == pytest.approx(5000.0 / 2.4)
+    assert material.lame_lambda == pytest.approx(5000.0 * 0.2 / (1.2 * 0.6))
+
+
+def test_derived_numbers():
+    fixed = {**PEN, "action_scale": ()}
+    turning = {**PEN, "action_scale": (0.0, 0.0, 0.0, 0.1, 0.1, 0.1)}
+    scene = Scene(bodies=(BALL, BLOCK), manipulators=(PEN, fixed, turning), material={"yield_stress": 10.0})
+    assert (scene.particle_count, scene.action_size) == (800, 9)
+    assert [tool.movable for tool in scene.manipulators] == [True, False, True]
+    assert scene.node_distance == 1.0 / 64
+    assert scene.particle_volume == (0.5 / 64) ** 2
+    assert scene.gravity == (0.0, -30.0, 0.0)
+    assert scene.domain == ((0.0, 0.0, 0.0), (1.0 - 3 / 64,) * 3)
+    assert scene.material_of(0).yield_stress == 10.0
+    assert Scene.model_validate_json(scene.model_dump_json()) == scene
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"bodies": ()}, "at least 1 item"),
+        ({"bodies": ({**BALL, "position": (0.95, 0.5, 0.5)},)}, "along x, outside the domain"),
+        ({"bodies": ({**BALL, "radius": 0.0},)}, "greater than 0"),
+        ({"bodies": ({**BALL, "particle_count": 0},)}, "greater than 0"),
+        ({"bodies": ({**BALL, "kind": "cone"},)}, "tag 'cone'"),
+        ({"bodies": ({**BALL, "colour": "red"},)}, "not permitted"),
+        ({"manipulators": ({**PEN, "action_scale": (0.1,)},)}, "action_scale has 1 components"),
+        ({"manipulators": ({**PEN, "action_scale": (-0.1, 0.0, 0.0)},)}, "greater than or equal to 0"),
+        ({"manipulators": ({**PEN, "rotation_wxyz": (1.0, 1.0, 0.0, 0.0)},)}, "unit quaternion"),
+        ({"manipulators": ({**PEN, "lower_bound": (1.0, 1.0, 1.0), "upper_bound": (0.0, 0.0, 0.0)},)}, "exceeds upper_bound"),
+        ({"manipulators": ({**PEN, "friction": math.inf},)}, "finite number"),
+        ({"manipulators": ({**PEN, "kind": "Hammer"},)}, "Hammer"),
+        ({"grid_size": 4}, "greater than or equal to 8"),
+        ({"time_step": 0.0}, "greater than 0"),
+        ({"time_step": math.nan}, "finite number|greater than 0"),
+        ({"substeps": 0}, "greater than or equal to 1"),
+        ({"material": {"poisson_ratio": 0.5}}, "less than 0.5"),
+    ],
+)
+def test_refuses(changes, message):
+    with pytest.raises(ValidationError, match=message):
+        Scene.model_validate({"bodies": (BALL,), "manipulators": (PEN,), **changes})
+
+
+def test_scenes_are_immutable():
+    scene = Scene(bodies=(BALL,))
+    with pytest.raises(ValidationError, match="frozen"):
+        scene.grid_size = 32
+
+
+@given(
+    position=st.tuples(*[st.floats(0.3, 0.6)] * 3),
+    widths=st.tuples(*[st.floats(0.01, 0.4)] * 3),
+    radius=st.floats(0.01, 0.2),
+    seed=st.integers(0, 1000),
+)
+def test_particles_fill_their_bodies(position, widths, radius, seed):
+    block = BodyBox(position=position, widths=widths, particle_count=50)
+    ball = BodySphere(position=position, radius=radius, particle_count=30)
+    scene = Scene(bodies=(block, ball), sampling_seed=seed)
+    particles = sample_particles(scene)
+    assert particles.shape == (80, 3)
+    assert (np.abs(particles[:50] - position) <= np.asarray(block.half_extents) + 1e-12).all()
+    assert (np.linalg.norm(particles[50:] - position, axis=1) <= radius + 1e-12).all()
+    np.testing.assert_array_equal(particles, sample_particles(scene))
+    assert body_index(scene).tolist() == [0] * 50 + [1] * 30
+
+
+def test_initial_state():
+    box = ManipulatorBox(position=(0.1, 0.2, 0.3), rotation_wxyz=(0.6, 0.0, 0.8, 0.0), half_extents=(0.1, 0.1, 0.1))
+    scene = Scene(bodies=(BALL,), manipulators=(box, ManipulatorCapsule(**{k: v for k, v in PEN.items() if k != "kind"})))
+    state = initial_state(scene, batch_size=2)
+    assert (state.batch_size, state.particle_count) == (2, 500)
+    assert not state.velocity.any()
+    assert not state.elastic_strain.any()
+    assert state.manipulator_pose[1, 0].tolist() == pytest.approx([0.1, 0.2, 0.3, 0.6, 0.0, 0.8, 0.0, 0.0])
