@@ -201,6 +201,7 @@ def test_pictures(directory, monkeypatch):
     assert "no pictures: RuntimeError: no font" in result.stderr
 
 
+@pytest.mark.filterwarnings("always::RuntimeWarning")
 def test_failing_observers_are_told_and_do_not_stop_the_run(directory, monkeypatch):
     import cpdeform_toy.plugin
     from cpdeform.core.hookspecs import hookimpl

@@ -31,11 +31,24 @@ def build_transfer(real: Any) -> SimpleNamespace:
     four = real(4.0)
 
     @wp.func
-    def base_node(x: vec3, inverse_distance: real):
-        # truncation, not floor: a particle in the lowest half cell keeps a stencil that starts at node 0
-        return wp.vec3i(
-            int(x[0] * inverse_distance - half), int(x[1] * inverse_distance - half), int(x[2] * inverse_distance - half)
-        )
+    def base_along(x: real, parameters: Parameters):
+        # truncation, not floor: a particle in the lowest half cell keeps a stencil that starts at node 0; and a position that
+        # is not finite keeps inside the grid, where it spreads nan instead of writing to foreign memory
+        return wp.min(wp.max(int(x * parameters.inverse_distance - half), 0), parameters.grid_size - 3)
+
+    @wp.func
+    def base_node(x: vec3, parameters: Parameters):
+        return wp.vec3i(base_along(x[0], parameters), base_along(x[1], parameters), base_along(x[2], parameters))
+
+    @wp.func
+    def clip(x: real, lower: real, upper: real):
+        # unlike min and max, comparisons let nan through
+        result = x
+        if x < lower:
+            result = lower
+        if x > upper:
+            result = upper
+        return result
 
     @wp.func
     def fraction(x: vec3, base: wp.vec3i, inverse_distance: real):
@@ -105,7 +118,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
         low = wp.vec3i(parameters.grid_size, parameters.grid_size, parameters.grid_size)
         high = wp.vec3i(0, 0, 0)
         for p in range(position.shape[1]):
-            base = base_node(position[0, p], parameters.inverse_distance)
+            base = base_node(position[0, p], parameters)
             low = wp.min(low, base)
             high = wp.max(high, base)
         result[0] = low
@@ -134,7 +147,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
         new, stress = material(trial, k[0], k[1], k[2])
         new_strain[world, p] = new
         x = position[world, p]
-        base = base_node(x, parameters.inverse_distance)
+        base = base_node(x, parameters)
         f = fraction(x, base, parameters.inverse_distance)
         a = parameters.node_distance * (parameters.stress_scale * stress + parameters.particle_mass * c)
         momentum = parameters.particle_mass * velocity[world, p] - a * f
@@ -159,7 +172,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
         world, index = wp.tid()
         p = first + index
         x = position[world, p]
-        base = base_node(x, parameters.inverse_distance)
+        base = base_node(x, parameters)
         f = fraction(x, base, parameters.inverse_distance)
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
         node = ((base[0] - origin[0]) * size[1] + base[1] - origin[1]) * size[2] + base[2] - origin[2]
@@ -185,7 +198,10 @@ def build_transfer(real: Any) -> SimpleNamespace:
         new_velocity[world, p] = v
         new_affine[world, p] = mat33(c0[0], c1[0], c2[0], c0[1], c1[1], c2[1], c0[2], c1[2], c2[2])
         moved = x + parameters.time_step * v
-        new_position[world, p] = wp.min(wp.max(moved, parameters.lower), parameters.upper)
+        lower, upper = parameters.lower, parameters.upper
+        new_position[world, p] = vec3(
+            clip(moved[0], lower[0], upper[0]), clip(moved[1], lower[1], upper[1]), clip(moved[2], lower[2], upper[2])
+        )
 
     @wp.kernel(**KERNEL_OPTIONS)
     def grid_to_particles_adjoint(
@@ -207,7 +223,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
         p = first + index
         x = position[world, p]
         v = new_velocity[world, p]
-        base = base_node(x, parameters.inverse_distance)
+        base = base_node(x, parameters)
         f = fraction(x, base, parameters.inverse_distance)
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
         dx, dy, dz = weight_slopes(f[0]), weight_slopes(f[1]), weight_slopes(f[2])
@@ -265,7 +281,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
         values, u0, u1, u2 = eigen(trial)
         stress = stress_of(values, u0, u1, u2, k[0], k[1], k[2])
         x = position[world, p]
-        base = base_node(x, parameters.inverse_distance)
+        base = base_node(x, parameters)
         f = fraction(x, base, parameters.inverse_distance)
         wx, wy, wz = weights(f[0]), weights(f[1]), weights(f[2])
         dx, dy, dz = weight_slopes(f[0]), weight_slopes(f[1]), weight_slopes(f[2])

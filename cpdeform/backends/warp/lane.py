@@ -112,9 +112,7 @@ class Lane:
             return wp.vec3i(0, 0, 0), wp.vec3i(n, n, n), n**3
         wp.launch(self.program.kernels.bounds, dim=1, inputs=[position, self.program.parameters, self._bounds], device="cpu")
         low, high = self._bounds_view.tolist()
-        # not finite positions turn into wild node numbers: stay inside the domain, the values stay nan
-        low = [min(max(value, 0), n - 3) for value in low]
-        size = [min(max(top, base + 2), n - 1) - base + 1 for base, top in zip(low, high, strict=True)]
+        size = [last - first + 1 for first, last in zip(low, high, strict=True)]
         return wp.vec3i(*low), wp.vec3i(*size), size[0] * size[1] * size[2]
 
     def _zeros(self, rows: int, nodes: int) -> Any:

@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+import builtins
+
+import imageio.v2
+import numpy as np
+import pytest
+import torch
+from cpdeform.core.deform import deform
+from cpdeform.core.errors import InputError
+from cpdeform.core.optimizer import TrajectoryOptimizer
+from cpdeform.core.plugins import load_registry
+from cpdeform.core.record import RunRecorder, load_record
+from cpdeform.core.scene import (
+    ManipulatorBox,
+    ManipulatorCapsule,
+    ManipulatorCylinder,
+    ManipulatorSphere,
+    ManipulatorTorus,
+)
+from cpdeform.core.signed_distance import signed_distance
+from cpdeform.report import draw_run
+from cpdeform.report.animation import draw_animation
+from cpdeform.report.render import fit_camera, render
+from cpdeform.report.shapes import tool_surface
+
+TOOLS = [
+    ManipulatorSphere(position=(0, 0, 0), radius=0.1),
+    ManipulatorCapsule(position=(0, 0, 0), radius=0.05, height=0.2),
+    ManipulatorBox(position=(0, 0, 0), half_extents=(0.1, 0.05, 0.2)),
+    ManipulatorBox(position=(0, 0, 0), half_extents=(0.1, 0.05, 0.2), rounding=0.02),
+    ManipulatorCylinder(position=(0, 0, 0), radius=0.1, half_height=0.05),
+    ManipulatorTorus(position=(0, 0, 0), major_radius=0.1, tube_radius=0.03),
+]
+
+
+@pytest.fixture
+def record(tmp_path, toy_task_file, toy_entry_points):
+    def make(**options):
+        registry = load_registry(toy_entry_points)
+        parts = {"simulator": "toy", "ot_solver": "toy", "placer": "toy", **options}
+        recorder = RunRecorder(tmp_path / "run")
+        optimizer = TrajectoryOptimizer(iterations=3)
+        deform(str(toy_task_file), registry=registry, optimizer=optimizer, observers=[recorder], **parts)
+        return recorder.directory
+
+    return make
+
+
+@pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.kind)
+def test_tool_surfaces_are_the_tools(tool):
+    """Every point lies on the zero of the signed distance, also of a turned tool, and the surface is closed."""
+    turn = np.array([0.5, 0.5, -0.1, 0.7])
+    pose = np.array([0.3, 0.4, 0.5, *(turn / np.linalg.norm(turn)), 0.0])
+    surface = tool_surface(tool, pose, rows=200, columns=200)
+    distance = signed_distance(tool, torch.as_tensor(pose), torch.as_tensor(surface.reshape(-1, 3)))
+    assert float(distance.abs().max()) < 2e-4
+    np.testing.assert_allclose(surface[:, 0], surface[:, -1], atol=1e-12)
+    # The divergence theorem on the closed mesh gives the volume.
+    a, b, c, d = surface[:-1, :-1], surface[1:, :-1], surface[1:, 1:], surface[:-1, 1:]
+    parts = [np.einsum("...i,...i->...", x - pose[:3], np.cross(y - pose[:3], z - pose[:3])) for x, y, z in ((a, b, c), (a, c, d))]
+    assert abs(sum(part.sum() for part in parts)) / 6.0 == pytest.approx(volume(tool), rel=0.02)
+
+
+def volume(tool):
+    match tool:
+        case ManipulatorSphere():
+            return 4 / 3 * np.pi * tool.radius**3
+        case ManipulatorCapsule():
+            return 4 / 3 * np.pi * tool.radius**3 + np.pi * tool.radius**2 * tool.height
+        case ManipulatorCylinder():
+            return np.pi * tool.radius**2 * 2 * tool.half_height
+        case ManipulatorTorus():
+            return 2 * np.pi**2 * tool.major_radius * tool.tube_radius**2
+    x, y, z = (2 * half for half in tool.half_extents)
+    r = tool.rounding
+    return x * y * z + 2 * r * (x * y + y * z + z * x) + np.pi * r**2 * (x + y + z) + 4 / 3 * np.pi * r**3
+
+
+def test_the_nearer_thing_hides_the_farther():
+    particles = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    colours = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    camera = fit_camera(np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), azimuth=0.0, elevation=0.0, aspect=1.0)
+    picture = render(camera, width=41, particles=particles, colours=colours, radius=0.3)
+    assert picture.shape == (41, 41, 4)
+    red, green, _, opacity = picture[20, 20]
+    assert green > 0.2 > red
+    assert opacity == 1.0
+    assert picture[0, 0, 3] == 0.0
+    behind = render(camera, width=41, particles=particles[::-1], colours=colours, radius=0.3)
+    assert behind[20, 20, 0] > 0.2
+
+
+def panels(path):
+    """The four panels without titles and colour bars."""
+    picture = imageio.v2.imread(path)[..., :3].astype(float)
+    height, width = picture.shape[:2]
+    return picture, [picture[height // 5 : 4 * height // 5, width * i // 4 : width * (i + 1) // 4] for i in range(4)]
+
+
+def test_picture_and_animation(record):
+    directory = record()
+    path = draw_run(directory)
+    assert path == directory / "picture.png"
+    picture, parts = panels(path)
+    assert picture.shape[0] > 400
+    assert picture.shape[1] > 1500
+    for part in parts:
+        assert part.std() > 10.0
+        assert (part < 250).any(axis=-1).mean() > 0.02
+    frames = list(imageio.v2.get_reader(directory / "animation.mp4"))
+    # 2 stages of 5 steps, start included, and the last one held.
+    assert len(frames) == 18
+    assert np.abs(frames[0].astype(float) - frames[10]).mean() > 0.5
+    assert {path.name for path in directory.iterdir() if path.name.startswith(".")} == set()
+
+
+def test_pictures_come_from_the_record_alone(record, toy_task_file):
+    directory = record(stages=1)
+    (toy_task_file.parent / "target.npz").unlink()
+    toy_task_file.unlink()
+    moved = directory.rename(directory.with_name("moved"))
+    assert draw_run(moved) == moved / "picture.png"
+
+
+def test_no_priorities_and_no_executed_plan(record, tmp_path):
+    from cpdeform_toy.parts import PlacerFixedToy
+
+    class Nowhere(PlacerFixedToy):
+        def ask(self, stage):
+            return []
+
+    directory = record(placer=Nowhere())
+    _, parts = panels(draw_run(directory))
+    assert all(part.std() > 10.0 for part in parts)
+    assert not list(directory.glob("animation*"))
+
+
+def test_gif_without_ffmpeg(record, monkeypatch):
+    monkeypatch.setattr("cpdeform.report.animation._has_ffmpeg", lambda: False)
+    directory = record(stages=1)
+    path = draw_animation(load_record(directory))
+    assert path == directory / "animation.gif"
+    assert len(imageio.v2.mimread(path)) >= 6
+
+
+def test_no_pyplot(record, monkeypatch):
+    """No figure is left in matplotlib's global state: pyplot is never imported."""
+    genuine = builtins.__import__
+
+    def guarded(name, *arguments, **options):
+        assert name != "matplotlib.pyplot"
+        return genuine(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", guarded)
+    draw_run(record(stages=1))
+
+
+def test_nothing_to_draw(tmp_path):
+    with pytest.raises(InputError, match=r"no run\.json"):
+        draw_run(tmp_path)
