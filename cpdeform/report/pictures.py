@@ -78,7 +78,9 @@ def draw_picture(record: RunRecord) -> Path:
     _draw_priorities(figure, axes[1], view, record, stage, placed)
     title = "result" if last.status is Status.FINISHED or record.finished_stages else "result (no plan was executed)"
     _draw_panel(axes[2], view, record, title, result.position[0], result.manipulator_pose[0])
-    _draw_panel(axes[3], view, record, "target", record.target, None)
+    # The goal often has another number of particles than the body.
+    target_view = dataclasses.replace(view, radius=_particle_radius(_numbers(record.target)))
+    _draw_panel(axes[3], target_view, record, "target", record.target, None)
     _add_height_bar(figure, axes, view)
     figure.suptitle(describe(record), fontsize=13)
     path = record.directory / "picture.png"

@@ -149,7 +149,7 @@ def _draw_points(camera: Camera, shape: tuple[int, int], points: Array, radius: 
 
 def _fill(values: Array, mask: NDArray[np.bool_], sigma: float) -> Array:
     """Smooth values (H, W) or (H, W, K) over the mask with a Gaussian of `sigma` samples; beyond it they are continued."""
-    from scipy.ndimage import gaussian_filter, zoom
+    from scipy.ndimage import gaussian_filter
 
     channels = values[..., None] if values.ndim == 2 else values
     stack = np.concatenate([np.where(mask[..., None], channels, 0.0), mask[..., None]], axis=-1).astype(np.float32)
@@ -163,8 +163,18 @@ def _fill(values: Array, mask: NDArray[np.bool_], sigma: float) -> Array:
     blurred = gaussian_filter(stack, (sigma / coarse, sigma / coarse, 0.0))
     filled = blurred[..., :-1] / np.maximum(blurred[..., -1:], 1e-6)
     if coarse > 1:
-        filled = zoom(filled, (coarse, coarse, 1), order=1, mode="nearest", grid_mode=True)[:height, :width]
+        filled = _enlarge(_enlarge(filled, coarse, height, axis=0), coarse, width, axis=1)
     return np.asarray(filled.reshape(values.shape), dtype=np.float64)
+
+
+def _enlarge(values: NDArray[np.float32], factor: int, count: int, *, axis: int) -> NDArray[np.float32]:
+    """Interpolate linearly along an axis, to the first `count` of the samples that each entry is `factor` of."""
+    place = np.clip((np.arange(count, dtype=np.float32) + 0.5) / factor - 0.5, 0, values.shape[axis] - 1)
+    lower = np.minimum(place.astype(int), max(values.shape[axis] - 2, 0))
+    upper = np.minimum(lower + 1, values.shape[axis] - 1)
+    weight = (place - lower).astype(np.float32)
+    weight = weight[:, None, None] if axis == 0 else weight[None, :, None]
+    return np.asarray(np.take(values, lower, axis=axis) * (1 - weight) + np.take(values, upper, axis=axis) * weight)
 
 
 def _lambert(camera: Camera, depth: Array, scale: float) -> Array:

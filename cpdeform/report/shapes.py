@@ -17,6 +17,9 @@ from cpdeform.core.scene import (
 
 Array = NDArray[np.float64]
 
+ARC_POINTS = 12
+"""Points on each rounded quarter turn of a block."""
+
 
 def tool_surface(manipulator: Manipulator, pose: Array, *, rows: int = 64, columns: int = 128) -> Array:
     """Points of a tool's surface in the world frame.
@@ -82,11 +85,11 @@ def _box(box: ManipulatorBox, rows: int, columns: int) -> Array:
 
     The cells that the octants' seams are stretched to are the faces; a face is flat, and is filled with further points.
     """
-    latitude = _seams(np.linspace(-0.5 * np.pi, 0.0, 6), np.linspace(0.0, 0.5 * np.pi, 6))
-    quadrants = [np.linspace(0.5 * np.pi * i, 0.5 * np.pi * (i + 1), 6) for i in range(4)]
+    latitude = _seams(np.linspace(-0.5 * np.pi, 0.0, ARC_POINTS), np.linspace(0.0, 0.5 * np.pi, ARC_POINTS))
+    quadrants = [np.linspace(0.5 * np.pi * i, 0.5 * np.pi * (i + 1), ARC_POINTS) for i in range(4)]
     longitude = _seams(*quadrants)
-    row_sign = np.repeat([-1.0, 1.0], 6)[:, None]
-    x_sign, z_sign = np.repeat([1.0, -1.0, -1.0, 1.0], 6), np.repeat([1.0, 1.0, -1.0, -1.0], 6)
+    row_sign = np.repeat([-1.0, 1.0], ARC_POINTS)[:, None]
+    x_sign, z_sign = np.repeat([1.0, -1.0, -1.0, 1.0], ARC_POINTS), np.repeat([1.0, 1.0, -1.0, -1.0], ARC_POINTS)
     cos_latitude, sin_latitude = np.cos(latitude)[:, None], np.sin(latitude)[:, None]
     normal = np.stack([cos_latitude * np.cos(longitude), sin_latitude + 0.0 * longitude, cos_latitude * np.sin(longitude)], axis=-1)
     corner = np.stack([x_sign + 0.0 * row_sign, row_sign + 0.0 * x_sign, z_sign + 0.0 * row_sign], axis=-1)

@@ -40,18 +40,16 @@ class Stroke:
         return result
 
 
-DOWN: Vector3 = (0.0, -1.0, 0.0)
-UP: Vector3 = (0.0, 1.0, 0.0)
 PEN_HEIGHT = 0.161
 """Height of the pen's centre when its tip is 1/1000 above the board, length units."""
 
 WRITER_STROKES: Mapping[str, Stroke] = MappingProxyType(
     {
-        "v1": Stroke((0.40, PEN_HEIGHT, 0.60), ((4, DOWN), (5, (1.0, 0.0, 0.0)), (1, UP))),
-        "v2": Stroke((0.60, PEN_HEIGHT, 0.60), ((4, DOWN), (5, (0.0, 0.0, -1.0)), (1, UP))),
-        "v3": Stroke((0.41, PEN_HEIGHT, 0.40), ((4, DOWN), (5, (0.8, 0.0, 0.6)), (1, UP))),
-        "v4": Stroke((0.60, PEN_HEIGHT, 0.41), ((5, DOWN), (4, (-1.0, 0.0, 0.0)), (1, UP))),
-        "v5": Stroke((0.40, PEN_HEIGHT, 0.46), ((3, DOWN), (6, (0.0, 0.0, 1.0)), (1, UP))),
+        "v1": Stroke((0.40, PEN_HEIGHT, 0.60), ((4, (0.3, -1.0, -0.4)), (6, (0.2, -0.3, -1.0)))),
+        "v2": Stroke((0.60, PEN_HEIGHT, 0.60), ((4, (-0.4, -1.0, -0.3)), (6, (-1.0, -0.3, -0.2)))),
+        "v3": Stroke((0.41, PEN_HEIGHT, 0.40), ((4, (0.4, -1.0, 0.2)), (6, (1.0, -0.3, 0.2)))),
+        "v4": Stroke((0.60, PEN_HEIGHT, 0.41), ((4, (0.0, -1.0, 0.5)), (6, (-0.2, -0.3, 1.0)))),
+        "v5": Stroke((0.42, PEN_HEIGHT, 0.60), ((5, (0.2, -1.0, -0.2)), (5, (1.0, -0.2, -0.1)))),
     }
 )
 """The strokes of the task `writer`, one a variant, all beside the pen's start."""

@@ -9,11 +9,12 @@ import time
 from pathlib import Path
 
 import pytest
+from toy_fixtures import TOYS
+from typer.testing import CliRunner
+
 from cpdeform import __version__
 from cpdeform.cli.main import app
 from cpdeform.core.record import load_record
-from toy_fixtures import TOYS
-from typer.testing import CliRunner
 
 PARTS = ["--backend", "toy", "--ot", "toy", "--placer", "toy", "--iterations", "3"]
 SECONDS_TO_WAIT = 60.0
@@ -204,6 +205,7 @@ def test_pictures(directory, monkeypatch):
 @pytest.mark.filterwarnings("always::RuntimeWarning")
 def test_failing_observers_are_told_and_do_not_stop_the_run(directory, monkeypatch):
     import cpdeform_toy.plugin
+
     from cpdeform.core.hookspecs import hookimpl
 
     def fail(result):
@@ -225,6 +227,7 @@ def test_tasks(directory):
 
 def test_plugins(directory, monkeypatch):
     import cpdeform_toy.plugin
+
     from cpdeform.core.hookspecs import hookimpl
 
     content = json.loads(invoke("plugins", "--json").stdout)

@@ -5,17 +5,18 @@ import math
 
 import pytest
 import torch
+from cpdeform_toy.parts import OTSolverExactToy, OTSolverToy, PlacerFixedToy, PlacerToy
+from cpdeform_toy.simulator import SimulatorToy
+
 from cpdeform.core.algorithm import Planner
-from cpdeform.core.deform import deform, deform_configuration
 from cpdeform.core.configuration import RunConfiguration
+from cpdeform.core.deform import deform, deform_configuration
 from cpdeform.core.errors import CapabilityError, InputError, UnknownNameError
 from cpdeform.core.objectives.transport import ObjectiveTransport
 from cpdeform.core.optimizer import TrajectoryOptimizer
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.result import Observer, Status
 from cpdeform.core.task import load_task
-from cpdeform_toy.parts import OTSolverExactToy, OTSolverToy, PlacerFixedToy, PlacerToy
-from cpdeform_toy.simulator import SimulatorToy
 
 
 class Diary(Observer):
@@ -136,9 +137,12 @@ def test_goes_on_from_a_state(task):
     with pytest.raises(InputError, match="single world"):
         planner(task).run(state=first.state.fork(2))
     with pytest.raises(InputError, match="particles"):
-        planner(task).run(state=dataclasses.replace(first.state, **{
-            name: getattr(first.state, name)[:, :5] for name in ("position", "velocity", "affine", "elastic_strain")
-        }))
+        planner(task).run(
+            state=dataclasses.replace(
+                first.state,
+                **{name: getattr(first.state, name)[:, :5] for name in ("position", "velocity", "affine", "elastic_strain")},
+            )
+        )
 
 
 def with_scene(task, **changes):

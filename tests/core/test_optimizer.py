@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from cpdeform_toy.simulator import SimulatorToy
+
 from cpdeform.core.errors import InputError
 from cpdeform.core.objective import ObjectiveAutograd
 from cpdeform.core.optimizer import TrajectoryOptimizer
 from cpdeform.core.task import load_task
-from cpdeform_toy.simulator import SimulatorToy
 
 
 class Distance(ObjectiveAutograd):

@@ -5,6 +5,7 @@ import sys
 import types
 
 import pytest
+
 from cpdeform.core.errors import InputError, MissingExtraError, PluginError, UnknownNameError
 from cpdeform.core.hook_observer import HookObserver
 from cpdeform.core.hookspecs import PluginSpec, hookimpl
@@ -71,7 +72,8 @@ def test_broken_plugins_are_reported_and_the_others_work(monkeypatch):
 
 def test_duplicates_name_both(monkeypatch):
     points = [
-        plugin(monkeypatch, name, cpdeform_placers=lambda target=f"{name}:x": [PluginSpec("same", target, "")]) for name in ("a", "b")
+        plugin(monkeypatch, name, cpdeform_placers=lambda target=f"{name}:x": [PluginSpec("same", target, "")])
+        for name in ("a", "b")
     ]
     with pytest.raises(PluginError, match=r'placer "same" is registered twice: .*a:x.*b:x'):
         load_registry(points)

@@ -12,6 +12,7 @@ from pathlib import Path
 import h5py
 import pytest
 import torch
+
 from cpdeform.core import record_files
 from cpdeform.core.configuration import RunConfiguration
 from cpdeform.core.deform import deform
@@ -111,11 +112,9 @@ def test_a_run_goes_on_from_its_record(tmp_path, run):
 
 
 def test_numbers_that_are_not_finite(tmp_path, run):
-    class Broken(Observer):
-        pass
+    from cpdeform_toy.simulator import SimulatorToy
 
     from cpdeform.core.task import load_task
-    from cpdeform_toy.simulator import SimulatorToy
 
     task = load_task(tmp_path / "shift.yaml")
     result = run(simulator=SimulatorToy(task.scene, batch_size=3, break_above=-2.0))
@@ -134,7 +133,7 @@ def test_directory_that_is_not_empty(tmp_path, run):
     (directory / "picture.png").write_text("of the old run")
     before = contents(directory)
     for attempt in (lambda: RunRecorder(directory), lambda: result.save(directory)):
-        with pytest.raises(InputError, match="a directory that is not empty.*--overwrite"):
+        with pytest.raises(InputError, match=r"a directory that is not empty.*--overwrite"):
             attempt()
     assert contents(directory) == before
     recorder = RunRecorder(directory, overwrite=True)

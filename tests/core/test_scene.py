@@ -4,12 +4,13 @@ import math
 
 import numpy as np
 import pytest
-from cpdeform.core.sampling import body_index, sample_particles
-from cpdeform.core.scene import BodyBox, BodySphere, ManipulatorBox, ManipulatorCapsule, Material, Scene
-from cpdeform.core.state import initial_state
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
+
+from cpdeform.core.sampling import body_index, sample_particles
+from cpdeform.core.scene import BodyBox, BodySphere, ManipulatorBox, ManipulatorCapsule, Material, Scene
+from cpdeform.core.state import initial_state
 
 BALL = {"kind": "sphere", "position": (0.5, 0.5, 0.5), "radius": 0.1, "particle_count": 500}
 BLOCK = {"kind": "box", "position": (0.3, 0.2, 0.3), "widths": (0.1, 0.2, 0.3), "particle_count": 300}

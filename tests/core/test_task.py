@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
+
 from cpdeform.core.configuration import RunConfiguration
 from cpdeform.core.errors import InputError, PluginError, UnknownNameError
 from cpdeform.core.plugins import load_registry
@@ -38,6 +39,7 @@ def test_names(toy_entry_points):
 
 def test_package_of_a_task_is_missing(monkeypatch, toy_entry_points):
     import cpdeform_toy.plugin
+
     from cpdeform.core.hookspecs import PluginSpec, hookimpl
 
     spec = PluginSpec("lost", "no_such_package:lost.yaml", "")
@@ -55,7 +57,10 @@ def test_package_of_a_task_is_missing(monkeypatch, toy_entry_points):
         ("variants: 3", "variants"),
         ("variants: {v1: 3}", r"variants\.v1"),
         ("name: x", "field required"),
-        ("name: x\nscen: {}\ntarget: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radius: .1}]}", 'Did you mean "scene"'),
+        (
+            "name: x\nscen: {}\ntarget: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radius: .1}]}",
+            'Did you mean "scene"',
+        ),
         ("target: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radius: -1}]}", r"bodies\.0\.sphere\.radius"),
         ("target: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radis: .1, radius: .1}]}", 'Did you mean "radius"'),
         ("target: t\nscene: {bodies: [{kind: sphere, position: [.9,.9,.9], radius: .3}]}", "outside the domain"),

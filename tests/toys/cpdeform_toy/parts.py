@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+
 from cpdeform.core.ot import OTCapabilities, OTResult, OTSolver, check_problem, fix_gauge
 from cpdeform.core.placer import Placement, Placer, PlacerCapabilities
 

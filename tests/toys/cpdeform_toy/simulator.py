@@ -6,9 +6,10 @@ import dataclasses
 import time
 
 import torch
+from torch import Tensor
+
 from cpdeform.core.simulator import RolloutGradient, Simulator, SimulatorCapabilities, Trajectory
 from cpdeform.core.state import State
-from torch import Tensor
 
 
 class SimulatorToy(Simulator):
