@@ -19,6 +19,17 @@ class OptimizerConfiguration(FrozenModel):
     initial_noise: float = Field(default=0.01, ge=0.0)
 
 
+class PrioritiesConfiguration(FrozenModel):
+    """How transport priorities are computed, on all particles and once per stage.
+
+    Attributes:
+        blur: Entropic blur of the transport problem, length units. The larger, the quicker and the smoother; up to half a
+            centimetre the potentials' peak stays at the particles that have to move.
+    """
+
+    blur: float = Field(default=5e-3, gt=0.0)
+
+
 class ObjectiveConfiguration(FrozenModel):
     """What a plan's loss is.
 
@@ -48,9 +59,10 @@ class RunConfiguration(FrozenModel):
         stages: Number of stages; the task's own where absent.
         optimizer: Options of the optimiser.
         objective: Options of the loss.
+        priorities: Options of the transport priorities.
         scene: Changes of the task's scene, e.g. ``{"ground_friction": 2.0, "bodies": {"0": {"particle_count": 3000}}}``.
         simulator_options: Further keyword options of the simulator.
-        ot_options: Keyword options of the transport solver that gives the priorities.
+        ot_options: Further keyword options of the transport solver that gives the priorities.
         placer_options: Keyword options of the placer.
     """
 
@@ -63,6 +75,7 @@ class RunConfiguration(FrozenModel):
     stages: int | None = Field(default=None, ge=1)
     optimizer: OptimizerConfiguration = OptimizerConfiguration()
     objective: ObjectiveConfiguration = ObjectiveConfiguration()
+    priorities: PrioritiesConfiguration = PrioritiesConfiguration()
     scene: dict[str, Any] = Field(default_factory=dict)
     simulator_options: dict[str, Any] = Field(default_factory=dict)
     ot_options: dict[str, Any] = Field(default_factory=dict)

@@ -65,6 +65,7 @@ def deform(
     """
     registry = registry or load_registry()
     task = load_task(task, registry=registry) if isinstance(task, str) else task
+    defaults = RunConfiguration()
     for kind, part in (("simulator", simulator), ("ot_solver", ot_solver), ("placer", placer)):
         if isinstance(part, str):
             registry.find(kind, part)
@@ -79,15 +80,17 @@ def deform(
         else simulator
     )
     if objective is None:
-        objective = transport_objective(task, ot_solver, used_simulator, registry=registry)
-    used_solver: OTSolver = registry.create("ot_solver", ot_solver) if isinstance(ot_solver, str) else ot_solver
+        objective = transport_objective(task, ot_solver, used_simulator, options=defaults.objective, registry=registry)
+    used_solver: OTSolver = (
+        registry.create("ot_solver", ot_solver, blur=defaults.priorities.blur) if isinstance(ot_solver, str) else ot_solver
+    )
     planner = Planner(
         task=task,
         simulator=used_simulator,
         ot_solver=used_solver,
         placer=used_placer,
         objective=objective,
-        optimizer=optimizer or TrajectoryOptimizer(),
+        optimizer=optimizer or TrajectoryOptimizer(**defaults.optimizer.model_dump()),
         seed=seed,
         observers=(*observers, HookObserver(registry.manager)),
         names=names,
@@ -123,7 +126,8 @@ def deform_configuration(
     simulator = registry.create(
         "simulator", configuration.backend, scene=task.scene, device=configuration.device, **simulator_options
     )
-    ot_solver = registry.create("ot_solver", configuration.ot, **configuration.ot_options)
+    solver_options = {"blur": configuration.priorities.blur, **configuration.ot_options}
+    ot_solver = registry.create("ot_solver", configuration.ot, **solver_options)
     objective = transport_objective(task, configuration.ot, simulator, options=configuration.objective, registry=registry)
     planner = Planner(
         task=task,
@@ -173,7 +177,7 @@ def transport_objective(
     simulator: Simulator,
     *,
     registry: Registry,
-    options: ObjectiveConfiguration | None = None,
+    options: ObjectiveConfiguration,
 ) -> ObjectiveTransport:
     """The default loss: transport cost from the last step's particles to the goal.
 
@@ -184,7 +188,6 @@ def transport_objective(
         registry: Where the name is looked up.
         options: Subset size, blur, refresh schedule, contact weight.
     """
-    options = options or ObjectiveConfiguration()
     solver: OTSolver = registry.create("ot_solver", ot_solver, blur=options.blur) if isinstance(ot_solver, str) else ot_solver
     target = torch.as_tensor(task.load_target()).to(device=simulator.device, dtype=simulator.dtype)
     return ObjectiveTransport(

@@ -38,7 +38,7 @@ def cpdeform_simulators() -> list[PluginSpec]:  # type: ignore[empty-body]
 
 @hookspec
 def cpdeform_ot_solvers() -> list[PluginSpec]:  # type: ignore[empty-body]
-    """Register subclasses of `cpdeform.core.ot.OTSolver`."""
+    """Register subclasses of `cpdeform.core.ot.OTSolver`, whose constructors take the keyword `blur` (length units)."""
 
 
 @hookspec

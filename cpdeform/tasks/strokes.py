@@ -72,4 +72,3 @@ def draw(stroke: Stroke, simulator: Simulator) -> NDArray[np.uint16]:
     trajectory = simulator.rollout(state.with_manipulators(pose), actions)
     position = trajectory.positions[0, -1].double().cpu().numpy()
     return np.round(position * POSITION_SCALE).astype(np.uint16)
-

@@ -26,6 +26,9 @@ TOOLS: dict[str, dict[str, Any]] = {
     "Torus": {"major_radius": 0.04, "tube_radius": 0.02, "position": (0.503, 0.123, 0.498)},
 }
 
+STEPS = {"position": 1e-8, "velocity": 1e-6, "affine": 1e-5, "elastic_strain": 1e-8, "manipulator_pose": 1e-8}
+"""Step of the finite differences for each tensor of the state."""
+
 
 def tool(kind: str, **changes: Any) -> dict[str, Any]:
     return {"kind": kind, "action_scale": ALL_MOTIONS, "rotation_wxyz": TILTED, **TOOLS[kind], **changes}
@@ -102,7 +105,13 @@ def test_gradients_equal_central_differences(name: str) -> None:
     direction, step = noise(actions), 1e-6
     slope = (loss(state, actions + step * direction) - loss(state, actions - step * direction)) / (2 * step)
     compare(slope, gradient.actions, direction, "actions")
-    for field, step in {"position": 1e-8, "velocity": 1e-6, "affine": 1e-5, "elastic_strain": 1e-8, "manipulator_pose": 1e-8}.items():
+    for field, step in {
+        "position": 1e-8,
+        "velocity": 1e-6,
+        "affine": 1e-5,
+        "elastic_strain": 1e-8,
+        "manipulator_pose": 1e-8,
+    }.items():
         value = getattr(state, field)
         direction = noise(value)
         if field == "manipulator_pose":
@@ -260,7 +269,12 @@ def test_repeated_rollouts_are_equal_bit_for_bit() -> None:
 def test_tools_move_as_told() -> None:
     simulator = SimulatorWarp(
         scene(
-            tool("Sphere", position=(0.3, 0.5, 0.5), rotation_wxyz=(1.0, 0.0, 0.0, 0.0), action_scale=(0.02, 0.02, 0.02, 0.0, 0.0, 0.5)),
+            tool(
+                "Sphere",
+                position=(0.3, 0.5, 0.5),
+                rotation_wxyz=(1.0, 0.0, 0.0, 0.0),
+                action_scale=(0.02, 0.02, 0.02, 0.0, 0.0, 0.5),
+            ),
             tool("Sphere", position=(0.7, 0.5, 0.5), upper_bound=(0.71, 1.0, 1.0)),
         ),
         dtype=torch.float64,
@@ -314,8 +328,9 @@ def test_bad_arguments_are_named() -> None:
         SimulatorWarp(CASES["sphere"], dtype=torch.float16)
     with pytest.raises(CapabilityError, match="mps"):
         SimulatorWarp(CASES["sphere"], device="mps")
+    foreign = dataclasses.replace(simulator.rollout(state, torch.zeros(1, 1, 3)), checkpoints=None)
     with pytest.raises(InputError, match="checkpoints"):
-        simulator.vjp(dataclasses.replace(simulator.rollout(state, torch.zeros(1, 1, 3)), checkpoints=None), torch.zeros(1, 2, 300, 3))
+        simulator.vjp(foreign, torch.zeros(1, 2, 300, 3))
 
 
 @pytest.mark.cuda

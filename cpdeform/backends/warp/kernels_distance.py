@@ -17,7 +17,7 @@ from cpdeform.backends.warp.kernels_types import BOX, CAPSULE, CYLINDER, SPHERE,
 def build_distance(real: Any) -> SimpleNamespace:
     """Warp functions of signed distances and rotations for one scalar type."""
     types = build_types(real)
-    vec3, vec4, vec8, Tool = types.vec3, types.vec4, types.vec8, types.Tool
+    vec3, vec4, vec8 = types.vec3, types.vec4, types.vec8
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     # PlasticineLab's length: finite gradient at zero
     length_regularization = real(1e-8)

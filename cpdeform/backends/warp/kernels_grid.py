@@ -22,7 +22,10 @@ def build_grid(real: Any) -> SimpleNamespace:
     vec3, vec4, vec8, Parameters, Tool = types.vec3, types.vec4, types.vec8, types.Parameters, types.Tool
     distance_and_normal, normal_adjoint = geometry.distance_and_normal, geometry.normal_adjoint
     pose_position, pose_axis, rotate, rotate_adjoint = (
-        geometry.pose_position, geometry.pose_axis, geometry.rotate, geometry.rotate_adjoint,
+        geometry.pose_position,
+        geometry.pose_axis,
+        geometry.rotate,
+        geometry.rotate_adjoint,
     )
     zero, one = real(0.0), real(1.0)
     smallest_mass = real(1e-12)
@@ -137,10 +140,20 @@ def build_grid(real: Any) -> SimpleNamespace:
             inverse = rotate_adjoint(before[3], -pose_axis(before), node - pose_position(before), gl)
             gq_before += vec4(inverse[0], -inverse[1], -inverse[2], -inverse[3])
             gp_before -= rotate(before[3], pose_axis(before), gl)
-            wp.atomic_add(grad_pose, world, frame, index, vec8(
-                gp_before[0], gp_before[1], gp_before[2], gq_before[0], gq_before[1], gq_before[2], gq_before[3], zero))
-            wp.atomic_add(grad_pose, world, frame + 1, index, vec8(
-                gp_after[0], gp_after[1], gp_after[2], gq_after[0], gq_after[1], gq_after[2], gq_after[3], zero))
+            wp.atomic_add(
+                grad_pose,
+                world,
+                frame,
+                index,
+                vec8(gp_before[0], gp_before[1], gp_before[2], gq_before[0], gq_before[1], gq_before[2], gq_before[3], zero),
+            )
+            wp.atomic_add(
+                grad_pose,
+                world,
+                frame + 1,
+                index,
+                vec8(gp_after[0], gp_after[1], gp_after[2], gq_after[0], gq_after[1], gq_after[2], gq_after[3], zero),
+            )
             result = gv
         return result
 
@@ -298,8 +311,17 @@ def build_grid(real: Any) -> SimpleNamespace:
                 for m in range(last):
                     w = contact(parameters, tools[m], poses[world, frame, m], poses[world, frame + 1, m], node, w)
                 g = contact_adjoint(
-                    parameters, tools[last], poses[world, frame, last], poses[world, frame + 1, last], node, w, g,
-                    grad_poses, pose_row * worlds + world, frame, last,
+                    parameters,
+                    tools[last],
+                    poses[world, frame, last],
+                    poses[world, frame + 1, last],
+                    node,
+                    w,
+                    g,
+                    grad_poses,
+                    pose_row * worlds + world,
+                    frame,
+                    last,
                 )
             inverse = one / total[3]
             result = vec4(inverse * g[0], inverse * g[1], inverse * g[2], -inverse * wp.dot(g, raw))

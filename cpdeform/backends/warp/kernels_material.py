@@ -39,8 +39,25 @@ def build_material(real: Any) -> SimpleNamespace:
     def expm1(x: real):
         result = wp.exp(x) - one
         if wp.abs(x) < real(0.25):
-            result = x * (one + x * half * (one + x * third * (one + x * real(0.25) * (one + x * real(0.2) * (
-                one + x * real(1.0 / 6.0) * (one + x * real(1.0 / 7.0) * (one + x * real(0.125))))))))
+            result = x * (
+                one
+                + x
+                * half
+                * (
+                    one
+                    + x
+                    * third
+                    * (
+                        one
+                        + x
+                        * real(0.25)
+                        * (
+                            one
+                            + x * real(0.2) * (one + x * real(1.0 / 6.0) * (one + x * real(1.0 / 7.0) * (one + x * real(0.125))))
+                        )
+                    )
+                )
+            )
         return result
 
     @wp.func
@@ -233,9 +250,7 @@ def build_material(real: Any) -> SimpleNamespace:
         if factor > zero:
             mean = third * (h[0] + h[1] + h[2])
             trial_h = deviator + vec3(mean, mean, mean)
-            gh = vec3(
-                (gs[0] + two * s[0] * e00) * s[0], (gs[1] + two * s[1] * e11) * s[1], (gs[2] + two * s[2] * e22) * s[2]
-            )
+            gh = vec3((gs[0] + two * s[0] * e00) * s[0], (gs[1] + two * s[1] * e11) * s[1], (gs[2] + two * s[2] * e22) * s[2])
             average = third * (gh[0] + gh[1] + gh[2])
             bend = factor / (norm * norm) * wp.dot(gh, deviator)
             for i in range(3):

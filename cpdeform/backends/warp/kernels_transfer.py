@@ -24,7 +24,10 @@ def build_transfer(real: Any) -> SimpleNamespace:
     types, law = build_types(real), build_material(real)
     vec3, vec4, vec6, mat33, Parameters = types.vec3, types.vec4, types.vec6, types.mat33, types.Parameters
     trial_strain, material, material_adjoint, trial_adjoint = (
-        law.trial_strain, law.material, law.material_adjoint, law.trial_adjoint,
+        law.trial_strain,
+        law.material,
+        law.material_adjoint,
+        law.trial_adjoint,
     )
     entries, symmetric, eigen, stress_of = law.entries, law.symmetric, law.eigen, law.stress_of
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
@@ -152,9 +155,18 @@ def build_transfer(real: Any) -> SimpleNamespace:
         a = parameters.node_distance * (parameters.stress_scale * stress + parameters.particle_mass * c)
         momentum = parameters.particle_mass * velocity[world, p] - a * f
         scatter(
-            grid, row + world, base, origin, size, weights(f[0]), weights(f[1]), weights(f[2]),
+            grid,
+            row + world,
+            base,
+            origin,
+            size,
+            weights(f[0]),
+            weights(f[1]),
+            weights(f[2]),
             extend(momentum, parameters.particle_mass),
-            extend(column(a, 0), zero), extend(column(a, 1), zero), extend(column(a, 2), zero),
+            extend(column(a, 0), zero),
+            extend(column(a, 1), zero),
+            extend(column(a, 2), zero),
         )
 
     @wp.kernel(**KERNEL_OPTIONS)

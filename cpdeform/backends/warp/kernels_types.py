@@ -66,6 +66,4 @@ def build_types(real: Any) -> SimpleNamespace:
         lower: vec3
         upper: vec3
 
-    return SimpleNamespace(
-        real=real, vec3=vec3, vec4=vec4, vec6=vec6, vec8=vec8, mat33=mat33, Parameters=Parameters, Tool=Tool
-    )
+    return SimpleNamespace(real=real, vec3=vec3, vec4=vec4, vec6=vec6, vec8=vec8, mat33=mat33, Parameters=Parameters, Tool=Tool)

@@ -139,27 +139,55 @@ class Lane:
         after = Particles(self._empty(types.vec3), self._empty(types.vec3), self._empty(types.mat33), self._empty(types.vec6))
 
         def scatter(block: int, first: int, count: int) -> None:
-            self._launch(kernels.particles_to_grid, count, [
-                particles.position, particles.velocity, particles.affine, particles.strain, program.constants,
-                program.parameters, first, block * self.worlds, origin, size, after.strain, grid])
+            self._launch(
+                kernels.particles_to_grid,
+                count,
+                [
+                    particles.position,
+                    particles.velocity,
+                    particles.affine,
+                    particles.strain,
+                    program.constants,
+                    program.parameters,
+                    first,
+                    block * self.worlds,
+                    origin,
+                    size,
+                    after.strain,
+                    grid,
+                ],
+            )
 
         def update(block: int, first: int, count: int) -> None:
-            self._launch(kernels.update_grid, count, [
-                grid, self.blocks, poses, program.tools, program.parameters, frame, first, origin, size, velocity])
+            self._launch(
+                kernels.update_grid,
+                count,
+                [grid, self.blocks, poses, program.tools, program.parameters, frame, first, origin, size, velocity],
+            )
 
         def gather(block: int, first: int, count: int) -> None:
-            self._launch(kernels.grid_to_particles, count, [
-                particles.position, velocity, program.parameters, first, origin, size,
-                after.position, after.velocity, after.affine])
+            self._launch(
+                kernels.grid_to_particles,
+                count,
+                [
+                    particles.position,
+                    velocity,
+                    program.parameters,
+                    first,
+                    origin,
+                    size,
+                    after.position,
+                    after.velocity,
+                    after.affine,
+                ],
+            )
 
         self._spread(self.particle_count, scatter)
         self._spread(nodes, update)
         self._spread(self.particle_count, gather)
         return Substep(particles, grid, origin, size), after
 
-    def backward(
-        self, substep: Substep, velocity_after: Any, poses: Any, frame: int, gradient: Particles, grad_poses: Any
-    ) -> None:
+    def backward(self, substep: Substep, velocity_after: Any, poses: Any, frame: int, gradient: Particles, grad_poses: Any) -> None:
         """The adjoint of one substep, in place.
 
         Args:
@@ -177,23 +205,73 @@ class Lane:
         grad_grid = self._zeros(self.blocks * self.worlds, nodes)
 
         def update(block: int, first: int, count: int) -> None:
-            self._launch(kernels.update_grid, count, [
-                substep.grid, 1, poses, program.tools, program.parameters, frame, first, origin, size, velocity])
+            self._launch(
+                kernels.update_grid,
+                count,
+                [substep.grid, 1, poses, program.tools, program.parameters, frame, first, origin, size, velocity],
+            )
 
         def scatter(block: int, first: int, count: int) -> None:
-            self._launch(kernels.grid_to_particles_adjoint, count, [
-                before.position, velocity_after, velocity, program.parameters, first, block * self.worlds, origin, size,
-                gradient.position, gradient.velocity, gradient.affine, grad_grid])
+            self._launch(
+                kernels.grid_to_particles_adjoint,
+                count,
+                [
+                    before.position,
+                    velocity_after,
+                    velocity,
+                    program.parameters,
+                    first,
+                    block * self.worlds,
+                    origin,
+                    size,
+                    gradient.position,
+                    gradient.velocity,
+                    gradient.affine,
+                    grad_grid,
+                ],
+            )
 
         def update_adjoint(block: int, first: int, count: int) -> None:
-            self._launch(kernels.update_grid_adjoint, count, [
-                substep.grid, self.blocks, poses, program.tools, program.parameters, frame, first, origin, size,
-                grad_grid, block, grad_poses])
+            self._launch(
+                kernels.update_grid_adjoint,
+                count,
+                [
+                    substep.grid,
+                    self.blocks,
+                    poses,
+                    program.tools,
+                    program.parameters,
+                    frame,
+                    first,
+                    origin,
+                    size,
+                    grad_grid,
+                    block,
+                    grad_poses,
+                ],
+            )
 
         def gather(block: int, first: int, count: int) -> None:
-            self._launch(kernels.particles_to_grid_adjoint, count, [
-                before.position, before.velocity, before.affine, before.strain, program.constants, program.parameters,
-                first, origin, size, grad_grid, gradient.position, gradient.velocity, gradient.affine, gradient.strain])
+            self._launch(
+                kernels.particles_to_grid_adjoint,
+                count,
+                [
+                    before.position,
+                    before.velocity,
+                    before.affine,
+                    before.strain,
+                    program.constants,
+                    program.parameters,
+                    first,
+                    origin,
+                    size,
+                    grad_grid,
+                    gradient.position,
+                    gradient.velocity,
+                    gradient.affine,
+                    gradient.strain,
+                ],
+            )
 
         self._spread(nodes, update)
         self._spread(self.particle_count, scatter)

@@ -149,7 +149,10 @@ class SimulatorWarp(Simulator):
         if tools:
             poses[:, 0] = state.manipulator_pose
             inputs = [
-                self._wrap(actions, self._real), self._program.tools, self.scene.substeps, self._wrap(poses, self._types.vec8)
+                self._wrap(actions, self._real),
+                self._program.tools,
+                self.scene.substeps,
+                self._wrap(poses, self._types.vec8),
             ]
             wp.launch(self._program.kernels.move_tools, dim=(worlds, tools), inputs=inputs, device=self._program.device)
         return poses
@@ -167,7 +170,7 @@ class SimulatorWarp(Simulator):
         with self._stream():
             poses = self._move_tools(state, actions)
             lanes = self._over_lanes(
-                self._lanes(worlds), lambda lane: self._rollout_lane(*lane, state, poses, positions, final, steps, keep)
+                self._lanes(worlds), lambda pair: self._rollout_lane(pair[0], pair[1], state, poses, positions, final, steps, keep)
             )
         frames = poses[:, :: self.scene.substeps, :tools]
         final = dataclasses.replace(final, manipulator_pose=frames[:, -1].clone())
@@ -217,9 +220,7 @@ class SimulatorWarp(Simulator):
                 records.append(record)
         return (tuple(records) if keep else None), particles
 
-    def vjp(
-        self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None
-    ) -> RolloutGradient:
+    def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
         if not isinstance(trajectory.checkpoints, tuple):
             raise InputError("trajectory", came="a trajectory without checkpoints", expected="one made by this simulator's rollout")
@@ -276,8 +277,12 @@ class SimulatorWarp(Simulator):
         types = self._types
         poses = self._move_tools(trajectory.initial_state, actions)
         inputs = [
-            self._wrap(actions, self._real), self._program.tools, self.scene.substeps, self._wrap(poses, types.vec8),
-            self._wrap(grad_poses, types.vec8), self._wrap(grad_actions, self._real),
+            self._wrap(actions, self._real),
+            self._program.tools,
+            self.scene.substeps,
+            self._wrap(poses, types.vec8),
+            self._wrap(grad_poses, types.vec8),
+            self._wrap(grad_actions, self._real),
             self._wrap(gradient.manipulator_pose, types.vec8),
         ]
         wp.launch(self._program.kernels.move_tools_adjoint, dim=(worlds, tools), inputs=inputs, device=self._program.device)
@@ -308,10 +313,8 @@ class SimulatorWarp(Simulator):
         particles = count * self._particle_bytes()
         snapshots = (step_count + 1) * count * 3 * self.dtype.itemsize
         whole = self._history_bytes(step_count)
-        if whole * self.batch_size <= self.memory_budget:
-            history = whole
-        else:
-            history = step_count * particles + self._history_bytes(1)
+        kept = step_count * particles + self._history_bytes(1)
+        history = whole if whole * self.batch_size <= self.memory_budget else kept
         # state, its gradient, the caller's gradient of the snapshots
         return self.batch_size * (history + 2 * snapshots + 4 * particles)
 
@@ -324,8 +327,7 @@ def _available_cores() -> int:
 
 
 def _initialize_warp() -> None:
-    """Start Warp without its banner."""
-    level = wp.config.log_level
-    wp.config.log_level = wp.LOG_ERROR
+    """Start Warp without its banner and its line per loaded module, unless the user asked for more than the default."""
+    if wp.config.log_level == wp.LOG_INFO:
+        wp.config.log_level = wp.LOG_WARNING
     wp.init()
-    wp.config.log_level = level
