@@ -15,8 +15,9 @@ class PlacerTransport(Placer):
 
     With priorities f_i and the distance d_i(x) of particle i to the surface of the tool at position x, the score is
     1/N sum_i f_i / (d_i(x)^2 + 1), maximised over a grid of positions x around that particle and then over finer grids
-    around the best. Distances count in units of `distance_scale`: 1 is the paper's formula, by which the score falls only
-    over the size of the whole domain; a smaller scale makes the neighbourhood of the tool count most.
+    around the best. Distances count in units of `distance_scale`. With a scale of 1, the domain's edge, d^2 << 1 for every
+    particle: the score is flat, far particles' small priorities outweigh the tool's neighbourhood, and on a board with one
+    stroke the tool lands in a corner of the grid. The default, a tool's radius, makes the neighbourhood count.
 
     The score depends on the gauge of the priorities, which is fixed by `OTResult`: zero weighted median.
 
@@ -27,7 +28,7 @@ class PlacerTransport(Placer):
         clearance: Least distance between the tool and any particle, length units.
         margin: How far beyond touching the particle the first grid reaches, length units; half of the tool's smallest half
             extent where absent.
-        distance_scale: Length that the score measures distances in.
+        distance_scale: Length that the score measures distances in; 1 is the paper's formula to the letter.
         max_gap: Largest distance between tool and body beyond `clearance`, length units. The paper leaves this to the
             score, which pushes the tool off the body where priorities are negative; None does the same.
 
@@ -48,7 +49,7 @@ class PlacerTransport(Placer):
         refinements: int = 2,
         clearance: float = 0.0,
         margin: float | None = None,
-        distance_scale: float = 1.0,
+        distance_scale: float = 0.03,
         max_gap: float | None = 0.0005,
     ) -> None:
         if not 0.0 < distance_scale < float("inf"):

@@ -2,7 +2,8 @@
 
 State is the elastic strain e = b - I with b = F F^T. For a trial e* = U diag(l) U^T, both the new strain and the stress share the
 eigenvectors U (the model is isotropic), so a symmetric 3x3 eigendecomposition replaces the SVD of F. The adjoint is the
-Daleckii-Krein formula; its divided differences are written in closed forms that do not cancel where eigenvalues meet.
+Daleckii-Krein formula; its divided differences are written in closed forms that do not cancel where eigenvalues meet. In
+float32, small strains inside the yield surface take power series instead.
 
 References:
     de Souza Neto, Peric, Owen, "Computational Methods for Plasticity", 2008, chapter 14 and appendix A (isotropic functions).
@@ -26,6 +27,8 @@ def build_material(real: Any) -> SimpleNamespace:
     smallest_stretch_squared = real(0.05 * 0.05 - 1.0)
     jacobi_tolerance = real(1e-12 if real is wp.float32 else 1e-30)
     norm_regularization = real(1e-8)
+    # squared strain up to which power series are exact to float32; float64 always takes the eigendecomposition
+    series_limit = real(9e-4 if real is wp.float32 else -1.0)
 
     @wp.func
     def log1p(x: real):
@@ -196,15 +199,73 @@ def build_material(real: Any) -> SimpleNamespace:
         return d[0] * wp.outer(u0, u0) + d[1] * wp.outer(u1, u1) + d[2] * wp.outer(u2, u2)
 
     @wp.func
+    def elastic_stress(trial: vec6, mu: real, lam: real, yield_stress: real):
+        """Kirchhoff stress of a small strain inside the yield surface, and whether the trial strain is one.
+
+        2 mu (b - sqrt(b)) + lambda J (J - 1) by power series in e = b - I: most particles, most of the time, and no eigenvectors.
+        """
+        stress = mat33()
+        inside = False
+        shear = trial[3] * trial[3] + trial[4] * trial[4] + trial[5] * trial[5]
+        if trial[0] * trial[0] + trial[1] * trial[1] + trial[2] * trial[2] + two * shear < series_limit:
+            e = symmetric(trial)
+            e2 = e * e
+            e3 = e2 * e
+            e4 = e2 * e2
+            hencky = half * e - real(0.25) * e2 + real(1.0 / 6.0) * e3 - real(0.125) * e4
+            mean = third * (hencky[0, 0] + hencky[1, 1] + hencky[2, 2])
+            norm = wp.ddot(hencky, hencky) - real(3.0) * mean * mean + norm_regularization
+            limit = yield_stress / (two * mu)
+            if norm <= limit * limit:
+                inside = True
+                j1 = volume_change(trial)
+                pressure = lam * (one + j1) * j1
+                stress = (two * mu) * (half * e + real(0.125) * e2 - real(0.0625) * e3 + real(5.0 / 128.0) * e4)
+                stress = stress + mat33(pressure, zero, zero, zero, pressure, zero, zero, zero, pressure)
+        return inside, stress
+
+    @wp.func
+    def volume_change(e: vec6):
+        """J - 1 with J^2 = det(I + e)."""
+        minors = e[0] * e[1] + e[0] * e[2] + e[1] * e[2] - e[3] * e[3] - e[4] * e[4] - e[5] * e[5]
+        product = e[0] * e[1] * e[2] + two * e[3] * e[4] * e[5] - e[0] * e[5] * e[5] - e[1] * e[4] * e[4] - e[2] * e[3] * e[3]
+        d = e[0] + e[1] + e[2] + minors + product
+        return d / (one + wp.sqrt(one + d))
+
+    @wp.func
+    def elastic_adjoint(trial: vec6, mu: real, lam: real, grad_new: mat33, grad_stress: mat33):
+        """Gradient (symmetric matrix) with respect to a trial strain that `elastic_stress` accepted."""
+        e = symmetric(trial)
+        g1 = e * grad_stress
+        g2 = e * g1
+        g3 = e * g2
+        sides = real(0.125) * g1 - real(0.0625) * g2 + real(5.0 / 128.0) * (g3 + g2 * e)
+        series = half * grad_stress + sides + wp.transpose(sides) - real(0.0625) * (g1 * e)
+        j = one + volume_change(trial)
+        # d J / d e = cofactor(I + e) / (2 J)
+        b0, b1, b2 = one + trial[0], one + trial[1], one + trial[2]
+        c01 = trial[4] * trial[5] - trial[3] * b2
+        c02 = trial[3] * trial[5] - trial[4] * b1
+        c12 = trial[3] * trial[4] - trial[5] * b0
+        c00 = b1 * b2 - trial[5] * trial[5]
+        c11 = b0 * b2 - trial[4] * trial[4]
+        c22 = b0 * b1 - trial[3] * trial[3]
+        pull = half / j * lam * (two * j - one) * wp.trace(grad_stress)
+        return grad_new + (two * mu) * series + pull * mat33(c00, c01, c02, c01, c11, c12, c02, c12, c22)
+
+    @wp.func
     def material(trial: vec6, mu: real, lam: real, yield_stress: real):
         """New elastic strain (six entries) and Kirchhoff stress (matrix) of a trial strain."""
-        values, u0, u1, u2 = eigen(trial)
-        a, h, deviator, norm, factor = return_map(values, mu, yield_stress)
         new = trial
-        if factor > zero:
-            squared = vec3(a[0] * (two + a[0]), a[1] * (two + a[1]), a[2] * (two + a[2]))
-            new = entries(compose(squared, u0, u1, u2))
-        return new, compose(principal_stress(a, mu, lam), u0, u1, u2)
+        inside, stress = elastic_stress(trial, mu, lam, yield_stress)
+        if not inside:
+            values, u0, u1, u2 = eigen(trial)
+            a, h, deviator, norm, factor = return_map(values, mu, yield_stress)
+            if factor > zero:
+                squared = vec3(a[0] * (two + a[0]), a[1] * (two + a[1]), a[2] * (two + a[2]))
+                new = entries(compose(squared, u0, u1, u2))
+            stress = compose(principal_stress(a, mu, lam), u0, u1, u2)
+        return new, stress
 
     @wp.func
     def stress_of(values: vec3, u0: vec3, u1: vec3, u2: vec3, mu: real, lam: real, yield_stress: real):
@@ -290,6 +351,8 @@ def build_material(real: Any) -> SimpleNamespace:
         entries=entries,
         trial_strain=trial_strain,
         material=material,
+        elastic_stress=elastic_stress,
+        elastic_adjoint=elastic_adjoint,
         stress_of=stress_of,
         material_adjoint=material_adjoint,
         trial_adjoint=trial_adjoint,

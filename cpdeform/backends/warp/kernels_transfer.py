@@ -30,6 +30,7 @@ def build_transfer(real: Any) -> SimpleNamespace:
         law.trial_adjoint,
     )
     entries, symmetric, eigen, stress_of = law.entries, law.symmetric, law.eigen, law.stress_of
+    elastic_stress, elastic_adjoint = law.elastic_stress, law.elastic_adjoint
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     four = real(4.0)
 
@@ -290,8 +291,12 @@ def build_transfer(real: Any) -> SimpleNamespace:
         e = strain[world, p]
         k = constants[p]
         trial = trial_strain(e, c, parameters.time_step)
-        values, u0, u1, u2 = eigen(trial)
-        stress = stress_of(values, u0, u1, u2, k[0], k[1], k[2])
+        values = vec3()
+        u0, u1, u2 = vec3(), vec3(), vec3()
+        inside, stress = elastic_stress(trial, k[0], k[1], k[2])
+        if not inside:
+            values, u0, u1, u2 = eigen(trial)
+            stress = stress_of(values, u0, u1, u2, k[0], k[1], k[2])
         x = position[world, p]
         base = base_node(x, parameters)
         f = fraction(x, base, parameters.inverse_distance)
@@ -336,7 +341,12 @@ def build_transfer(real: Any) -> SimpleNamespace:
         grad_position[world, p] = grad_position[world, p] + parameters.inverse_distance * slope
         grad_velocity[world, p] = parameters.particle_mass * gp
         gs = (half * parameters.stress_scale) * (ga + wp.transpose(ga))
-        gt = material_adjoint(values, u0, u1, u2, k[0], k[1], k[2], symmetric(grad_strain[world, p]), gs)
+        gn = symmetric(grad_strain[world, p])
+        gt = mat33()
+        if inside:
+            gt = elastic_adjoint(trial, k[0], k[1], gn, gs)
+        else:
+            gt = material_adjoint(values, u0, u1, u2, k[0], k[1], k[2], gn, gs)
         ge, gd = trial_adjoint(e, c, parameters.time_step, gt)
         grad_strain[world, p] = entries(ge)
         grad_affine[world, p] = parameters.particle_mass * ga + gd

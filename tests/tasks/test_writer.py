@@ -1,0 +1,72 @@
+"""The task `writer`: its targets are this project's own, reproducible, and out of reach from the pen's start."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from cpdeform import load_task
+from cpdeform.backends.warp.simulator import SimulatorWarp
+from cpdeform.core.objectives.metrics import soft_iou
+from cpdeform.core.objectives.plasticinelab import mass_grid
+from cpdeform.core.sampling import sample_particles
+from cpdeform.core.signed_distance import signed_distance
+from cpdeform.core.state import manipulator_pose
+from cpdeform.core.task import Task
+from cpdeform.tasks.strokes import POSITION_SCALE, WRITER_STROKES, draw
+
+VARIANTS = ("v1", "v2", "v3", "v4", "v5")
+
+
+@pytest.fixture(params=VARIANTS)
+def task(request: pytest.FixtureRequest) -> Task:
+    return load_task(f"writer-{request.param}")
+
+
+def displacement(task: Task) -> np.ndarray:
+    return np.linalg.norm(task.load_target() - sample_particles(task.scene), axis=1)
+
+
+def test_every_variant_has_a_stroke_and_a_target() -> None:
+    assert tuple(WRITER_STROKES) == VARIANTS
+    targets = [load_task(f"writer-{variant}").load_target() for variant in VARIANTS]
+    assert len({target.tobytes() for target in targets}) == len(VARIANTS)
+    assert load_task("writer").name == "writer-v1"
+
+
+def test_target_is_the_board_with_one_local_stroke(task: Task) -> None:
+    moved = displacement(task)
+    assert moved.max() > 0.02
+    assert np.quantile(moved, 0.5) < 0.003
+    assert 0.01 < (moved > 0.01).mean() < 0.25
+
+
+def test_pen_starts_outside_the_body_and_beside_the_stroke(task: Task) -> None:
+    particles = torch.as_tensor(sample_particles(task.scene))
+    pose = manipulator_pose(task.scene)
+    pen = task.scene.manipulators[0]
+    assert float(signed_distance(pen, pose[0], particles).min()) > 0.0
+    start = sample_particles(task.scene)
+    pressed = start[displacement(task) > 0.02]
+    away = np.linalg.norm(pressed[:, [0, 2]] - np.asarray(pen.position)[[0, 2]], axis=1)
+    assert away.min() > 0.01
+    assert np.median(away) > 0.05
+
+
+def test_goal_is_nearer_to_itself_than_the_start_is(task: Task) -> None:
+    """Otherwise the normalised incremental IoU would have no way to go."""
+    start = mass_grid(torch.as_tensor(sample_particles(task.scene)), task.scene)
+    goal = mass_grid(torch.as_tensor(task.load_target()), task.scene)
+    assert float(soft_iou(goal, goal) - soft_iou(start, goal)) > 1e-3
+
+
+def test_target_files_are_compact(task: Task) -> None:
+    assert task.target.stat().st_size < 80_000
+
+
+@pytest.mark.slow
+def test_a_target_is_redrawn_bit_for_bit() -> None:
+    task = load_task("writer-v1")
+    drawn = draw(WRITER_STROKES["v1"], SimulatorWarp(task.scene, dtype=torch.float64))
+    assert np.array_equal(drawn / POSITION_SCALE, task.load_target())
