@@ -1,0 +1,1 @@
+"""Experiments: comparisons over tasks, parts and seeds, as tables."""
