@@ -266,17 +266,19 @@ def still_trajectory(state: State, step_count: int, action_size: int) -> Traject
 
 
 def _pair(placements: list[Placement], found: Iterable[OptimizationResult]) -> list[PlacementResult]:
-    plans = [(float(loss), actions) for result in found for loss, actions in zip(result.loss, result.actions, strict=True)]
-    return [PlacementResult(placement, loss, actions) for placement, (loss, actions) in zip(placements, plans, strict=True)]
+    plans = [plan for result in found for plan in zip(result.loss, result.actions, result.finite, strict=True)]
+    return [
+        PlacementResult(placement, float(loss), actions, bool(finite))
+        for placement, (loss, actions, finite) in zip(placements, plans, strict=True)
+    ]
 
 
 def _stage_status(candidates: list[PlacementResult], best: int | None, loss_before: float) -> Status:
     if best is None:
         return Status.NO_PLACEMENT
-    loss = candidates[best].loss
-    if loss == float("inf") or loss != loss:
-        return Status.NON_FINITE
-    return Status.FINISHED if loss < loss_before else Status.NO_IMPROVEMENT
+    if candidates[best].loss < loss_before:
+        return Status.FINISHED
+    return Status.NO_IMPROVEMENT if any(candidate.finite for candidate in candidates) else Status.NON_FINITE
 
 
 class _Clock:

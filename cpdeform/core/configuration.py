@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
+from cpdeform.core.errors import InputError
 from cpdeform.core.scene import FrozenModel
 
 
@@ -70,7 +72,7 @@ class RunConfiguration(FrozenModel):
     backend: str = "warp"
     ot: str = "geomloss"
     placer: str = "transport"
-    device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?)$")
+    device: str = "cpu"
     seed: int = Field(default=0, ge=0)
     stages: int | None = Field(default=None, ge=1)
     optimizer: OptimizerConfiguration = OptimizerConfiguration()
@@ -80,3 +82,10 @@ class RunConfiguration(FrozenModel):
     simulator_options: dict[str, Any] = Field(default_factory=dict)
     ot_options: dict[str, Any] = Field(default_factory=dict)
     placer_options: dict[str, Any] = Field(default_factory=dict)
+
+    @field_validator("device")
+    @classmethod
+    def _check_device(cls, value: str) -> str:
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", value):
+            raise InputError("device", came=f'"{value}"', expected='"cpu", "cuda" or "cuda:N"')
+        return value

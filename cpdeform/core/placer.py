@@ -59,11 +59,13 @@ class PlacementResult:
         placement: The placement that was asked for.
         loss: Best loss of its plan, objective units.
         actions: The plan (T, A) with that loss, in [-1, 1].
+        finite: Whether every loss and gradient on the way was finite; otherwise the search ended early.
     """
 
     placement: Placement
     loss: float
     actions: Tensor
+    finite: bool = True
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from cpdeform.core.errors import InputError
+
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -122,13 +124,13 @@ class ManipulatorBase(FrozenModel):
     @model_validator(mode="after")
     def _check(self) -> ManipulatorBase:
         if len(self.action_scale) not in (0, 3, 6):
-            count = len(self.action_scale)
-            raise ValueError(f"action_scale has {count} components; give 0 (fixed), 3 (translation) or 6 (+ rotation)")
+            expected = "0 (fixed), 3 (translation) or 6 components (translation, rotation)"
+            raise InputError("action_scale", came=f"{len(self.action_scale)} components", expected=expected)
         norm = sum(component * component for component in self.rotation_wxyz) ** 0.5
         if not 0.99 < norm < 1.01:
-            raise ValueError(f"rotation_wxyz has norm {norm:.4g}; give a unit quaternion (w, x, y, z)")
+            raise InputError("rotation_wxyz", came=f"a norm of {norm:.4g}", expected="a unit quaternion (w, x, y, z)")
         if any(low > high for low, high in zip(self.lower_bound, self.upper_bound, strict=True)):
-            raise ValueError("lower_bound exceeds upper_bound")
+            raise InputError("lower_bound", came=f"{self.lower_bound}", expected=f"at most upper_bound = {self.upper_bound}")
         return self
 
     @property
@@ -226,9 +228,11 @@ class Scene(FrozenModel):
                 low = body.position[axis] - body.half_extents[axis]
                 high = body.position[axis] + body.half_extents[axis]
                 if low < lower[axis] - 1e-6 or high > upper[axis] + 1e-6:
-                    raise ValueError(
-                        f"bodies.{index} spans [{low:.4g}, {high:.4g}] along {name}, outside the domain "
-                        f"[{lower[axis]:.4g}, {upper[axis]:.4g}]; move or shrink the body"
+                    raise InputError(
+                        f"bodies.{index}",
+                        came=f"a body from {low:.4g} to {high:.4g} along {name}",
+                        expected=f"one inside the domain, from {lower[axis]:.4g} to {upper[axis]:.4g}",
+                        remedy="Move or shrink it.",
                     )
         return self
 

@@ -143,6 +143,11 @@ def validate(model: type[Model], data: Any, *, source: str) -> Model:
         if first["type"] == "extra_forbidden":
             *path, name = first["loc"]
             raise UnknownNameError(f"{source}: field {field}", str(name), _field_names(model, path)) from error
+        cause = first.get("ctx", {}).get("error")
+        if isinstance(cause, InputError):
+            parts = [str(part) for part in first["loc"]]
+            place = ".".join(parts if parts and parts[-1] == cause.argument else [*parts, cause.argument])
+            raise InputError(f"{source}: {place}", came=cause.came, expected=cause.expected, remedy=cause.remedy) from error
         came = repr(first["input"])
         message = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
         if message.startswith(("greater", "less")):
