@@ -19,8 +19,11 @@ SHARED = Path(os.environ.get("CPDEFORM_SHARED", Path(__file__).resolve().parents
 SCENES = {
     "assembly-v2": ("assembly", "Assembly3D-v2"),
     "move-v2": ("move", "Move3D-v2"),
+    "chopsticks-v2": ("chopsticks", "Chopsticks3D-v2"),
     "multistage_airplane-v1": ("airplane", None),
+    "multistage_star-v1": ("star", None),
     "pinch-v2": ("pinch", "Pinch3D-v2"),
+    "rollingpin-v2": ("rolling-pin", "Rollingpin3D-v2"),
     "rope-v2": ("rope", "Rope3D-v2"),
     "table-v2": ("table", "Table3D-v2"),
     "torus-v2": ("torus", "Torus3D-v2"),

@@ -9,7 +9,9 @@ References:
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -109,7 +111,7 @@ class ManipulatorBase(FrozenModel):
         rotation_wxyz: Start rotation as a unit quaternion (w, x, y, z), local frame to world frame.
         friction: Coulomb friction coefficient against the clay, dimensionless.
         action_scale: Motion per environment step at action 1: three translations (length units) and optionally three
-            rotations (radians, world frame). Empty: the tool does not move.
+            rotations (radians, world frame). Empty: the tool does not move. Kinds with motions of their own say so.
         lower_bound: The position is clipped to stay above this corner, length units.
         upper_bound: The position is clipped to stay below this corner, length units.
     """
@@ -121,10 +123,13 @@ class ManipulatorBase(FrozenModel):
     lower_bound: Vector3 = (0.0, 0.0, 0.0)
     upper_bound: Vector3 = (1.0, 1.0, 1.0)
 
+    action_meanings: ClassVar[Mapping[int, str]] = MappingProxyType({0: "fixed", 3: "translation", 6: "translation, rotation"})
+    """What the possible numbers of action components stand for."""
+
     @model_validator(mode="after")
     def _check(self) -> ManipulatorBase:
-        if len(self.action_scale) not in (0, 3, 6):
-            expected = "0 (fixed), 3 (translation) or 6 components (translation, rotation)"
+        if len(self.action_scale) not in self.action_meanings:
+            expected = " or ".join(f"{count} ({meaning})" for count, meaning in self.action_meanings.items())
             raise InputError("action_scale", came=f"{len(self.action_scale)} components", expected=expected)
         norm = sum(component * component for component in self.rotation_wxyz) ** 0.5
         if not 0.99 < norm < 1.01:
@@ -151,12 +156,46 @@ class ManipulatorSphere(ManipulatorBase):
     radius: PositiveFloat
 
 
-class ManipulatorCapsule(ManipulatorBase):
+class ManipulatorRod(ManipulatorBase):
     """All points within `radius` of the segment y in [-height/2, height/2] of the local frame, length units."""
 
-    kind: Literal["Capsule"] = "Capsule"
     radius: PositiveFloat
     height: PositiveFloat
+
+
+class ManipulatorCapsule(ManipulatorRod):
+    """A rod that is moved like any tool."""
+
+    kind: Literal["Capsule"] = "Capsule"
+
+
+class ManipulatorRollingPin(ManipulatorRod):
+    """A rod that rolls.
+
+    Its three actions turn it about its own axis (radians), rolling it sideways by 0.03 length units a radian, turn it about the
+    vertical (radians), and lift it (length units).
+    """
+
+    kind: Literal["RollingPin"] = "RollingPin"
+    action_meanings: ClassVar[Mapping[int, str]] = MappingProxyType({0: "fixed", 3: "roll, turn, lift"})
+
+
+class ManipulatorChopsticks(ManipulatorBase):
+    """Two parallel rods of `radius` and `height` at x = +-gap/2 of the local frame, whose origin is at their upper ends.
+
+    Attributes:
+        radius: Radius of a rod, length units.
+        height: Length of a rod's segment, length units.
+        gap: Start distance between the rods' axes, length units; actions never close it below 0.06.
+    """
+
+    kind: Literal["Chopsticks"] = "Chopsticks"
+    radius: PositiveFloat
+    height: PositiveFloat
+    gap: PositiveFloat = 0.06
+    action_meanings: ClassVar[Mapping[int, str]] = MappingProxyType(
+        {0: "fixed", 7: "translation, rotation in the tool's own frame, closing of the gap"}
+    )
 
 
 class ManipulatorBox(ManipulatorBase):
@@ -184,7 +223,13 @@ class ManipulatorTorus(ManipulatorBase):
 
 
 Manipulator = Annotated[
-    ManipulatorSphere | ManipulatorCapsule | ManipulatorBox | ManipulatorCylinder | ManipulatorTorus,
+    ManipulatorSphere
+    | ManipulatorCapsule
+    | ManipulatorBox
+    | ManipulatorCylinder
+    | ManipulatorTorus
+    | ManipulatorRollingPin
+    | ManipulatorChopsticks,
     Field(discriminator="kind"),
 ]
 

@@ -16,8 +16,9 @@ from cpdeform.core.rotation import rotate_inverse
 from cpdeform.core.scene import (
     Manipulator,
     ManipulatorBox,
-    ManipulatorCapsule,
+    ManipulatorChopsticks,
     ManipulatorCylinder,
+    ManipulatorRod,
     ManipulatorSphere,
     ManipulatorTorus,
 )
@@ -31,7 +32,7 @@ def signed_distance(manipulator: Manipulator, pose: Tensor, points: Tensor) -> T
 
     Args:
         manipulator: The tool; only its shape counts, not its start pose.
-        pose: Tool poses (..., 8): position (length units), unit quaternion wxyz, gap (unused by these tools).
+        pose: Tool poses (..., 8): position (length units), unit quaternion wxyz, gap (Chopsticks).
         points: Points (..., P, 3), length units; the leading axes broadcast with those of `pose`.
 
     Returns:
@@ -45,17 +46,23 @@ def signed_distance(manipulator: Manipulator, pose: Tensor, points: Tensor) -> T
     if points.ndim < 2 or points.shape[-1] != 3:
         raise InputError("points", came=f"shape {tuple(points.shape)}", expected="shape (..., points, 3)")
     local = rotate_inverse(pose[..., None, 3:7], points - pose[..., None, :3])
-    return local_distance(manipulator, *local.unbind(-1))
+    return local_distance(manipulator, *local.unbind(-1), gap=pose[..., None, 7])
 
 
-def local_distance(manipulator: Manipulator, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """Signed distance (...) of points given by their coordinates x, y, z (...) in the tool's local frame, length units."""
+def local_distance(manipulator: Manipulator, x: Tensor, y: Tensor, z: Tensor, *, gap: Tensor | float | None = None) -> Tensor:
+    """Signed distance (...) of points given by their coordinates x, y, z (...) in the tool's local frame, length units.
+
+    The `gap` between chopsticks is the tool's start gap where absent.
+    """
     match manipulator:
         case ManipulatorSphere():
             return _length(x, y, z) - manipulator.radius
-        case ManipulatorCapsule():
+        case ManipulatorRod():
+            return _segment_distance(x, y, z, 0.5 * manipulator.height) - manipulator.radius
+        case ManipulatorChopsticks():
             half = 0.5 * manipulator.height
-            return _length(x, y - y.clamp(-half, half), z) - manipulator.radius
+            aside = x.abs() - 0.5 * (manipulator.gap if gap is None else gap)
+            return _segment_distance(aside, y + half, z, half) - manipulator.radius
         case ManipulatorBox():
             outside = [axis.abs() - half for axis, half in zip((x, y, z), manipulator.half_extents, strict=True)]
             return _corner_distance(*outside) - manipulator.rounding
@@ -64,6 +71,11 @@ def local_distance(manipulator: Manipulator, x: Tensor, y: Tensor, z: Tensor) ->
         case ManipulatorTorus():
             return _length(_length(x, z) - manipulator.major_radius, y) - manipulator.tube_radius
     raise InputError("manipulator", came=type(manipulator).__name__, expected="a manipulator of cpdeform.core.scene")
+
+
+def _segment_distance(x: Tensor, y: Tensor, z: Tensor, half: float) -> Tensor:
+    """Distance to the segment y in [-half, half]."""
+    return _length(x, y - y.clamp(-half, half), z)
 
 
 def _length(*components: Tensor) -> Tensor:

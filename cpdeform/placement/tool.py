@@ -10,8 +10,9 @@ from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import (
     Manipulator,
     ManipulatorBox,
-    ManipulatorCapsule,
+    ManipulatorChopsticks,
     ManipulatorCylinder,
+    ManipulatorRod,
     ManipulatorSphere,
     ManipulatorTorus,
 )
@@ -34,8 +35,10 @@ def tool_half_extents(manipulator: Manipulator, quaternion: Tensor) -> Tensor:
     match manipulator:
         case ManipulatorSphere():
             return torch.full_like(along, manipulator.radius)
-        case ManipulatorCapsule():
+        case ManipulatorRod():
             return along * (0.5 * manipulator.height) + manipulator.radius
+        case ManipulatorChopsticks():
+            return axes @ torch.tensor([0.5 * manipulator.gap, manipulator.height, 0.0]).to(axes) + manipulator.radius
         case ManipulatorBox():
             return axes @ torch.tensor(manipulator.half_extents).to(axes) + manipulator.rounding
         case ManipulatorCylinder():

@@ -9,8 +9,9 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.scene import (
     Manipulator,
     ManipulatorBox,
-    ManipulatorCapsule,
+    ManipulatorChopsticks,
     ManipulatorCylinder,
+    ManipulatorRod,
     ManipulatorSphere,
     ManipulatorTorus,
 )
@@ -29,7 +30,7 @@ def tool_surface(manipulator: Manipulator, pose: Array, *, rows: int = 64, colum
 
     Args:
         manipulator: The tool.
-        pose: Its pose (8,): position (length units), unit quaternion wxyz, gap (unused by these tools).
+        pose: Its pose (8,): position (length units), unit quaternion wxyz, gap (Chopsticks).
         rows: Points from pole to pole, about.
         columns: Points around, about.
 
@@ -38,6 +39,11 @@ def tool_surface(manipulator: Manipulator, pose: Array, *, rows: int = 64, colum
     """
     if isinstance(manipulator, ManipulatorBox):
         local = _box(manipulator, rows, columns)
+    elif isinstance(manipulator, ManipulatorChopsticks):
+        rod = _revolve(_profile(manipulator, rows // 2), columns) - [0.0, 0.5 * manipulator.height, 0.0]
+        aside = np.array([0.5 * float(pose[7]), 0.0, 0.0])
+        # Both rods in one grid: the cells between one rod's last pole and the other's first have no area.
+        local = np.concatenate([rod - aside, rod + aside])
     else:
         local = _revolve(_profile(manipulator, rows), columns)
     # Imported on use: scipy's rotations take a quarter of a second to import.
@@ -55,7 +61,7 @@ def _profile(manipulator: Manipulator, rows: int) -> Array:
         case ManipulatorSphere():
             half = np.stack([np.cos(quarter), np.sin(quarter)], axis=1) * manipulator.radius
             corners = np.concatenate([half, (half * [1.0, -1.0])[::-1]])
-        case ManipulatorCapsule():
+        case ManipulatorRod() | ManipulatorChopsticks():
             half = np.stack([np.cos(quarter), np.sin(quarter)], axis=1) * manipulator.radius - [0.0, 0.5 * manipulator.height]
             corners = np.concatenate([half, (half * [1.0, -1.0])[::-1]])
         case ManipulatorCylinder():

@@ -16,7 +16,9 @@ from cpdeform.core.scene import (
     Manipulator,
     ManipulatorBox,
     ManipulatorCapsule,
+    ManipulatorChopsticks,
     ManipulatorCylinder,
+    ManipulatorRollingPin,
     ManipulatorSphere,
     ManipulatorTorus,
 )
@@ -30,6 +32,7 @@ TOOLS: dict[str, Manipulator] = {
     "box": ManipulatorBox(position=ORIGIN, half_extents=(0.1, 0.2, 0.3)),
     "rounded": ManipulatorBox(position=ORIGIN, half_extents=(0.1, 0.2, 0.3), rounding=0.05),
     "cylinder": ManipulatorCylinder(position=ORIGIN, radius=0.2, half_height=0.3),
+    "rolling pin": ManipulatorRollingPin(position=ORIGIN, radius=0.1, height=0.4),
     "torus": ManipulatorTorus(position=ORIGIN, major_radius=0.3, tube_radius=0.1),
 }
 IDENTITY = torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
@@ -100,6 +103,7 @@ def test_sign_tells_inside(name: str) -> None:
         "box": 0.2 * 0.4 * 0.6,
         "rounded": 0.2 * 0.4 * 0.6 + 0.1 * (0.08 + 0.12 + 0.24) + math.pi * 0.05**2 * 1.2 + 4 / 3 * math.pi * 0.05**3,
         "cylinder": math.pi * 0.2**2 * 0.6,
+        "rolling pin": math.pi * 0.1**2 * 0.4 + 4 / 3 * math.pi * 0.1**3,
         "torus": 2 * math.pi**2 * 0.3 * 0.1**2,
     }
     inside = signed_distance(tool, IDENTITY, cloud(200_000)) < 0.0
@@ -136,7 +140,7 @@ def test_gradients_match_finite_differences(name: str) -> None:
 def test_gradients_are_finite_everywhere(name: str, dtype: torch.dtype) -> None:
     values = torch.tensor([0.0, -0.0, 1e-40, 1e-30, 0.1, 0.2, -0.2, 0.3, 10.0], dtype=dtype)
     points = torch.cartesian_prod(values, values, values).requires_grad_()
-    pose = IDENTITY.to(dtype).requires_grad_()
+    pose = IDENTITY.clone().to(dtype).requires_grad_()
     distance = signed_distance(TOOLS[name], pose, points)
     distance.sum().backward()
     assert points.grad is not None
@@ -153,6 +157,40 @@ def test_same_values_with_and_without_gradient(name: str) -> None:
     assert torch.equal(
         signed_distance(TOOLS[name], IDENTITY, points), signed_distance(TOOLS[name], IDENTITY, points.requires_grad_()).detach()
     )
+
+
+CHOPSTICKS = ManipulatorChopsticks(position=ORIGIN, radius=0.1, height=0.4, gap=0.5)
+
+
+@pytest.mark.parametrize(
+    ("point", "distance"),
+    [
+        ((0.0, -0.2, 0.0), 0.2),  # midway between the rods
+        ((0.3, 0.0, 0.0), -0.1),  # a rod's upper end, the origin's height
+        ((-0.3, -0.4, 0.0), -0.1),  # the other rod's lower end
+        ((0.3, 0.3, 0.0), 0.2),
+        ((-0.3, -0.8, 0.0), 0.3),
+        ((0.8, -0.2, 0.0), 0.4),
+    ],
+)
+def test_chopsticks_are_two_rods_as_far_apart_as_the_pose_says(point: tuple[float, float, float], distance: float) -> None:
+    pose = IDENTITY.clone()
+    pose[7] = 0.6
+    found = signed_distance(CHOPSTICKS, pose, torch.tensor([point], dtype=torch.float64))
+    assert float(found[0]) == pytest.approx(distance, abs=1e-12)
+
+
+def test_gradient_reaches_the_gap() -> None:
+    pose = IDENTITY.clone()
+    pose[7] = 0.6
+    points = cloud(8, seed=4)
+    assert torch.autograd.gradcheck(lambda pose: signed_distance(CHOPSTICKS, pose, points), (pose.requires_grad_(),))
+
+
+def test_half_extents_hold_the_chopsticks() -> None:
+    quaternion = from_rotation_vector(torch.tensor([0.4, 1.1, -0.7], dtype=torch.float64))
+    surface = rotate(quaternion, surface_points(CHOPSTICKS, resolution=48)).abs().amax(dim=0)
+    assert bool((surface <= tool_half_extents(CHOPSTICKS, quaternion) + 1e-9).all())
 
 
 def test_leading_axes_broadcast() -> None:

@@ -63,7 +63,7 @@ def test_package_of_a_task_is_missing(monkeypatch, toy_entry_points):
         ),
         ("target: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radius: -1}]}", r"bodies\.0\.sphere\.radius"),
         ("target: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radis: .1, radius: .1}]}", 'Did you mean "radius"'),
-        ("target: t\nscene: {bodies: [{kind: sphere, position: [.9,.9,.9], radius: .3}]}", "outside the domain"),
+        ("target: t\nscene: {bodies: [{kind: sphere, position: [.9,.9,.9], radius: .3}]}", "inside the domain"),
     ],
 )
 def test_bad_task_files(tmp_path, content, message):

@@ -16,6 +16,7 @@ from cpdeform.core.record import RunRecorder, load_record
 from cpdeform.core.scene import (
     ManipulatorBox,
     ManipulatorCapsule,
+    ManipulatorChopsticks,
     ManipulatorCylinder,
     ManipulatorSphere,
     ManipulatorTorus,
@@ -34,6 +35,7 @@ TOOLS = [
     ManipulatorBox(position=(0, 0, 0), half_extents=(0.1, 0.05, 0.2), rounding=0.02),
     ManipulatorCylinder(position=(0, 0, 0), radius=0.1, half_height=0.05),
     ManipulatorTorus(position=(0, 0, 0), major_radius=0.1, tube_radius=0.03),
+    ManipulatorChopsticks(position=(0, 0, 0), radius=0.03, height=0.2, gap=0.1),
 ]
 
 
@@ -54,7 +56,7 @@ def record(tmp_path, toy_task_file, toy_entry_points):
 def test_tool_surfaces_are_the_tools(tool):
     """Every point lies on the zero of the signed distance, also of a turned tool, and the surface is closed."""
     turn = np.array([0.5, 0.5, -0.1, 0.7])
-    pose = np.array([0.3, 0.4, 0.5, *(turn / np.linalg.norm(turn)), 0.0])
+    pose = np.array([0.3, 0.4, 0.5, *(turn / np.linalg.norm(turn)), 0.15])
     surface = tool_surface(tool, pose, rows=200, columns=200)
     distance = signed_distance(tool, torch.as_tensor(pose), torch.as_tensor(surface.reshape(-1, 3)))
     assert float(distance.abs().max()) < 2e-4
@@ -71,6 +73,8 @@ def volume(tool):
             return 4 / 3 * np.pi * tool.radius**3
         case ManipulatorCapsule():
             return 4 / 3 * np.pi * tool.radius**3 + np.pi * tool.radius**2 * tool.height
+        case ManipulatorChopsticks():
+            return 2 * (4 / 3 * np.pi * tool.radius**3 + np.pi * tool.radius**2 * tool.height)
         case ManipulatorCylinder():
             return np.pi * tool.radius**2 * 2 * tool.half_height
         case ManipulatorTorus():

@@ -1,7 +1,8 @@
 """Signed distances of the manipulators in their local frames, outward normals, and the derivative of the normals.
 
-The entries of `Tool.size`: Sphere (radius), Capsule (radius, height), Box (half extents, rounding), Cylinder (radius, half
-height), Torus (major radius, tube radius); lengths.
+The entries of `Tool.size`, lengths: Sphere (radius); Capsule, RollingPin and Chopsticks (radius, height); Box (half extents,
+rounding); Cylinder (radius, half height); Torus (major radius, tube radius). Chopsticks are the capsule nearer to a point:
+`part_centre` is its centre.
 """
 
 import functools
@@ -10,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from cpdeform.backends.warp.kernels_types import BOX, CAPSULE, CYLINDER, SPHERE, TORUS, build_types
+from cpdeform.backends.warp.kernels_types import BOX, CAPSULE, CHOPSTICKS, CYLINDER, ROLLING_PIN, SPHERE, TORUS, build_types
 
 
 @functools.cache
@@ -54,6 +55,14 @@ def build_distance(real: Any) -> SimpleNamespace:
         return vec3(p[0] / r, zero, p[2] / r), r
 
     @wp.func
+    def part_centre(kind: int, size: vec4, gap: real, p: vec3):
+        """Centre of the part of a tool that is nearest to the local point p; zero but for chopsticks."""
+        result = vec3(zero, zero, zero)
+        if kind == wp.static(CHOPSTICKS):
+            result = vec3(half * gap * sign(p[0]), -half * size[1], zero)
+        return result
+
+    @wp.func
     def distance_and_normal(kind: int, size: vec4, p: vec3):
         """Signed distance and outward normal at the local point p, as (normal, distance)."""
         distance = zero
@@ -62,7 +71,7 @@ def build_distance(real: Any) -> SimpleNamespace:
             r = length(p)
             distance = r - size[0]
             normal = p / r
-        if kind == wp.static(CAPSULE):
+        if kind == wp.static(CAPSULE) or kind == wp.static(ROLLING_PIN) or kind == wp.static(CHOPSTICKS):
             h = half * size[1]
             q = vec3(p[0], p[1] - wp.min(wp.max(p[1], -h), h), p[2])
             r = length(q)
@@ -113,7 +122,7 @@ def build_distance(real: Any) -> SimpleNamespace:
         if kind == wp.static(SPHERE):
             r = length(p)
             result = project(g, p / r) / r
-        if kind == wp.static(CAPSULE):
+        if kind == wp.static(CAPSULE) or kind == wp.static(ROLLING_PIN) or kind == wp.static(CHOPSTICKS):
             h = half * size[1]
             q = vec3(p[0], p[1] - wp.min(wp.max(p[1], -h), h), p[2])
             r = length(q)
@@ -178,6 +187,7 @@ def build_distance(real: Any) -> SimpleNamespace:
         return vec4(two * wp.dot(g, c), gu[0], gu[1], gu[2])
 
     return SimpleNamespace(
+        part_centre=part_centre,
         distance_and_normal=distance_and_normal,
         normal_adjoint=normal_adjoint,
         pose_position=pose_position,

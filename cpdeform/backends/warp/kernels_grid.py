@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from cpdeform.backends.warp.kernels_distance import build_distance
-from cpdeform.backends.warp.kernels_types import KERNEL_OPTIONS, build_types
+from cpdeform.backends.warp.kernels_types import CHOPSTICKS, KERNEL_OPTIONS, build_types
 from cpdeform.core.scene import WALL_NODES
 
 
@@ -21,13 +21,14 @@ def build_grid(real: Any) -> SimpleNamespace:
     types, geometry = build_types(real), build_distance(real)
     vec3, vec4, vec8, Parameters, Tool = types.vec3, types.vec4, types.vec8, types.Parameters, types.Tool
     distance_and_normal, normal_adjoint = geometry.distance_and_normal, geometry.normal_adjoint
+    part_centre = geometry.part_centre
     pose_position, pose_axis, rotate, rotate_adjoint = (
         geometry.pose_position,
         geometry.pose_axis,
         geometry.rotate,
         geometry.rotate_adjoint,
     )
-    zero, one = real(0.0), real(1.0)
+    zero, half, one = real(0.0), real(0.5), real(1.0)
     smallest_mass = real(1e-12)
     smallest_influence = real(0.1)
     sticky_friction = real(10.0)
@@ -56,7 +57,8 @@ def build_grid(real: Any) -> SimpleNamespace:
     def contact(parameters: Parameters, tool: Tool, before: vec8, after: vec8, node: vec3, velocity: vec3):
         """A node's velocity after contact with one tool."""
         local = rotate(before[3], -pose_axis(before), node - pose_position(before))
-        local_normal, distance = distance_and_normal(tool.kind, tool.size, local)
+        centre = part_centre(tool.kind, tool.size, before[7], local)
+        local_normal, distance = distance_and_normal(tool.kind, tool.size, local - centre)
         k = influence(parameters, distance)
         result = velocity
         if k > zero:
@@ -88,7 +90,8 @@ def build_grid(real: Any) -> SimpleNamespace:
     ):
         """Gradient with respect to the velocity before contact; adds those of both poses to `grad_pose`."""
         local = rotate(before[3], -pose_axis(before), node - pose_position(before))
-        local_normal, distance = distance_and_normal(tool.kind, tool.size, local)
+        centre = part_centre(tool.kind, tool.size, before[7], local)
+        local_normal, distance = distance_and_normal(tool.kind, tool.size, local - centre)
         k = influence(parameters, distance)
         result = g
         if k > zero:
@@ -133,9 +136,15 @@ def build_grid(real: Any) -> SimpleNamespace:
             gl = rotate(after[3], -pose_axis(after), gvc) - rotate(before[3], -pose_axis(before), gvc)
             # normal and influence
             gq_before += rotate_adjoint(before[3], pose_axis(before), local_normal, gn)
-            gl += normal_adjoint(tool.kind, tool.size, local, rotate(before[3], -pose_axis(before), gn))
+            gs = normal_adjoint(tool.kind, tool.size, local - centre, rotate(before[3], -pose_axis(before), gn))
             if parameters.softness > zero and distance > zero:
-                gl -= (gk * parameters.softness * k) * local_normal
+                gs -= (gk * parameters.softness * k) * local_normal
+            gl += gs
+            gap = zero
+            if tool.kind == wp.static(CHOPSTICKS):
+                gap = half * gs[0]
+                if local[0] >= zero:
+                    gap = -gap
             # local = R(before)^T (node - position)
             inverse = rotate_adjoint(before[3], -pose_axis(before), node - pose_position(before), gl)
             gq_before += vec4(inverse[0], -inverse[1], -inverse[2], -inverse[3])
@@ -145,7 +154,7 @@ def build_grid(real: Any) -> SimpleNamespace:
                 world,
                 frame,
                 index,
-                vec8(gp_before[0], gp_before[1], gp_before[2], gq_before[0], gq_before[1], gq_before[2], gq_before[3], zero),
+                vec8(gp_before[0], gp_before[1], gp_before[2], gq_before[0], gq_before[1], gq_before[2], gq_before[3], gap),
             )
             wp.atomic_add(
                 grad_pose,

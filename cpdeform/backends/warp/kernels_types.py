@@ -11,8 +11,16 @@ from typing import Any
 
 import warp as wp
 
-SPHERE, CAPSULE, BOX, CYLINDER, TORUS = range(5)
-KIND_NUMBERS = {"Sphere": SPHERE, "Capsule": CAPSULE, "Box": BOX, "Cylinder": CYLINDER, "Torus": TORUS}
+SPHERE, CAPSULE, BOX, CYLINDER, TORUS, ROLLING_PIN, CHOPSTICKS = range(7)
+KIND_NUMBERS = {
+    "Sphere": SPHERE,
+    "Capsule": CAPSULE,
+    "Box": BOX,
+    "Cylinder": CYLINDER,
+    "Torus": TORUS,
+    "RollingPin": ROLLING_PIN,
+    "Chopsticks": CHOPSTICKS,
+}
 """Numbers of the manipulator kinds inside kernels."""
 
 KERNEL_OPTIONS: dict[str, Any] = {
@@ -31,11 +39,12 @@ def build_types(real: Any) -> SimpleNamespace:
         real: `wp.float32` or `wp.float64`.
 
     Returns:
-        vec3, vec4, vec6, vec8, mat33, the struct `Parameters` (the scene's constants) and the struct `Tool` (a manipulator).
+        vec3, vec4, vec6, vec7, vec8, mat33, the struct `Parameters` (the scene's constants) and the struct `Tool` (a manipulator).
     """
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
     vec6 = wp.types.vector(6, real)
+    vec7 = wp.types.vector(7, real)
     vec8 = wp.types.vector(8, real)
     mat33 = wp.types.matrix((3, 3), real)
 
@@ -62,8 +71,10 @@ def build_types(real: Any) -> SimpleNamespace:
         friction: real
         action_offset: int
         action_size: int
-        scale: vec6  # motion per substep at action 1: length, radians
+        scale: vec7  # motion per substep at action 1: length, radians
         lower: vec3
         upper: vec3
 
-    return SimpleNamespace(real=real, vec3=vec3, vec4=vec4, vec6=vec6, vec8=vec8, mat33=mat33, Parameters=Parameters, Tool=Tool)
+    return SimpleNamespace(
+        real=real, vec3=vec3, vec4=vec4, vec6=vec6, vec7=vec7, vec8=vec8, mat33=mat33, Parameters=Parameters, Tool=Tool
+    )

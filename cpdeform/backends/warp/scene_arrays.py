@@ -13,8 +13,9 @@ from cpdeform.core.scene import (
     WALL_NODES,
     Manipulator,
     ManipulatorBox,
-    ManipulatorCapsule,
+    ManipulatorChopsticks,
     ManipulatorCylinder,
+    ManipulatorRod,
     ManipulatorSphere,
     Scene,
 )
@@ -24,7 +25,7 @@ def tool_size(manipulator: Manipulator) -> tuple[float, ...]:
     """The lengths that a manipulator's signed distance depends on, in the order of `kernels_distance`, padded to four."""
     if isinstance(manipulator, ManipulatorSphere):
         return (manipulator.radius, 0.0, 0.0, 0.0)
-    if isinstance(manipulator, ManipulatorCapsule):
+    if isinstance(manipulator, (ManipulatorRod, ManipulatorChopsticks)):
         return (manipulator.radius, manipulator.height, 0.0, 0.0)
     if isinstance(manipulator, ManipulatorBox):
         return (*manipulator.half_extents, manipulator.rounding)
@@ -68,7 +69,7 @@ def make_tools(scene: Scene, real: Any, device: str) -> Any:
         tool.action_offset = offset
         tool.action_size = manipulator.action_size
         scale = [value / scene.substeps for value in manipulator.action_scale]
-        tool.scale = types.vec6(*scale, *[0.0] * (6 - len(scale)))
+        tool.scale = types.vec7(*scale, *[0.0] * (7 - len(scale)))
         tool.lower = types.vec3(*manipulator.lower_bound)
         tool.upper = types.vec3(*manipulator.upper_bound)
         offset += manipulator.action_size
