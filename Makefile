@@ -13,6 +13,7 @@ run: $(INSTALLED)
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest
+	cd plugins/cpdeform-example && ../../$(BIN)/python -m pytest
 
 quick: $(INSTALLED)
 	$(BIN)/python -m pytest -m "not slow"
@@ -21,6 +22,7 @@ lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	cd plugins/cpdeform-example && ../../$(BIN)/mypy
 
 targets: $(INSTALLED)
 	$(BIN)/python -m cpdeform.tasks.make_targets --check
@@ -29,6 +31,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch==2.13.0
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-deps --editable plugins/cpdeform-example
 	touch $(INSTALLED)
 
 clean:

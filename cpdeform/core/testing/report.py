@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, Literal, TypeVar
 
-from cpdeform.core.errors import CpdeformError
+from cpdeform.core.errors import CpdeformError, UnknownNameError
 
 Bench = TypeVar("Bench")
 CheckStatus = Literal["passed", "failed", "skipped"]
@@ -121,11 +121,27 @@ class CheckItem(Generic[Bench]):
         except Skip as reason:
             return Check(self.name, "skipped", advice=str(reason))
         except Exception as error:
-            return Check(self.name, "failed", advice=f"It raised {type(error).__name__}: {error} {self.advice}".replace("\n", " "))
+            raised = " ".join(f"It raised {type(error).__name__}: {error}".split()).rstrip(".:")
+            return Check(self.name, "failed", advice=f"{raised}. {self.advice}")
         if finding.figure <= finding.bound:
             return Check(self.name, "passed", finding.figure, finding.bound)
         note = f"Worst: {finding.note}. " if finding.note else ""
         return Check(self.name, "failed", finding.figure, finding.bound, note + self.advice)
+
+
+def choose(items: Sequence[CheckItem[Bench]], only: Sequence[str]) -> list[CheckItem[Bench]]:
+    """Checks that have one of the given texts as name or, where no check has, as part of it; all where none is given.
+
+    Raises:
+        UnknownNameError: A text is part of no check's name.
+    """
+    names, chosen = [item.name for item in items], set()
+    for text in only:
+        found = [text] if text in names else [name for name in names if text in name]
+        if not found:
+            raise UnknownNameError("check", text, names)
+        chosen.update(found)
+    return [item for item in items if not only or item.name in chosen]
 
 
 def run_checks(subject: str, items: Sequence[CheckItem[Bench]], bench: Bench) -> Report:

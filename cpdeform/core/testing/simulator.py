@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import Simulator
-from cpdeform.core.testing.report import Check, Report, run_checks
+from cpdeform.core.testing.report import Check, Report, choose, run_checks
 from cpdeform.core.testing.simulator_bench import (
     SimulatorBench,
     SimulatorFactory,
@@ -21,7 +23,9 @@ from cpdeform.core.testing.simulator_physics import PHYSICS_CHECKS
 SIMULATOR_CHECKS = (*CONTRACT_CHECKS, *PHYSICS_CHECKS, *GRADIENT_CHECKS)
 
 
-def check_simulator(factory: SimulatorFactory, *, scene: Scene | None = None, device: torch.device | str = "cpu") -> Report:
+def check_simulator(
+    factory: SimulatorFactory, *, scene: Scene | None = None, device: torch.device | str = "cpu", only: Sequence[str] = ()
+) -> Report:
     """Check a simulator: contract, physics, and gradients against central differences.
 
     It is tested in double precision where it declares that, otherwise in its default type with wider bounds.
@@ -31,13 +35,15 @@ def check_simulator(factory: SimulatorFactory, *, scene: Scene | None = None, de
         scene: Scene of the checks that need no particular one (shapes, states, batches, gradients); a block of 300 particles
             on the floor with two tools of the first declared kinds where absent.
         device: Where to test.
+        only: Run only the checks of these names, or whose names contain these texts.
 
     Returns:
         What was found; `Report.raise_if_failed` turns failures into an error.
 
     Raises:
-        InputError: `scene` is not a scene.
+        InputError: `scene` is not a scene, or no check has a name that `only` asks for.
     """
+    items = choose(SIMULATOR_CHECKS, only)
     complain_about_scene(scene)
     name = getattr(getattr(factory, "func", factory), "__name__", type(factory).__name__)
     try:
@@ -49,4 +55,4 @@ def check_simulator(factory: SimulatorFactory, *, scene: Scene | None = None, de
     except Exception as error:
         advice = f"factory(scene, batch_size=1, device=..., dtype=None) raised {type(error).__name__}: {error}"
         return Report(name, (Check("it can be built", "failed", advice=advice),))
-    return run_checks(name, SIMULATOR_CHECKS, bench)
+    return run_checks(name, items, bench)

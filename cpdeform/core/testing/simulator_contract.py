@@ -105,17 +105,17 @@ def check_fork(bench: SimulatorBench) -> Finding:
 def check_record(bench: SimulatorBench) -> Finding:
     """A state that went through the file of a run record continues as the one that did not."""
     simulator = bench.make(bench.scene)
-    actions = random_actions(simulator)
-    start = stirred(simulator)
+    start, actions = stirred(simulator), random_actions(simulator)
     trajectory = simulator.rollout(start, actions)
     middle = trajectory.final_state
+    expected = simulator.rollout(middle, actions).final_state
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / "stage-000.h5"
         write_stage(path, _stage_result(start, trajectory))
         read = read_stage(path).state.to(device=simulator.device)
     if state_difference(read, middle) > 0.0:
         return Finding(state_difference(read, middle), 0.0, "the state read from the file")
-    after, expected = simulator.rollout(read, actions).final_state, simulator.rollout(middle, actions).final_state
+    after = simulator.rollout(read, actions).final_state
     return Finding(state_difference(after, expected), bench.bound(1e-9, 1e-3), "the rollout from it")
 
 
@@ -160,9 +160,10 @@ def check_batch(bench: SimulatorBench) -> Finding:
     state, actions = stirred(simulator, batch_size=3), random_actions(simulator, batch_size=3)
     together = simulator.rollout(state, actions)
     alone = [simulator.rollout(state.select(world), actions[world : world + 1]) for world in range(3)]
-    figures = [largest_difference(one.positions[0], together.positions[world]) for world, one in enumerate(alone)]
-    poses = [largest_difference(one.manipulator_poses[0], together.manipulator_poses[world]) for world, one in enumerate(alone)]
-    return Finding(max(figures + poses), bench.bound(1e-10, 1e-5))
+    figures = []
+    for name in ("positions", "manipulator_poses"):
+        figures += [largest_difference(getattr(one, name)[0], getattr(together, name)[world]) for world, one in enumerate(alone)]
+    return Finding(max(figures), bench.bound(1e-10, 1e-5))
 
 
 def check_determinism(bench: SimulatorBench) -> Finding:
@@ -271,17 +272,29 @@ CONTRACT_CHECKS: tuple[CheckItem[SimulatorBench], ...] = (
     CheckItem("shapes and types of the trajectory", check_shapes, "See the attributes of Trajectory and State."),
     CheckItem("state and actions are not modified", check_inputs_untouched, "Copy the inputs before writing to them."),
     CheckItem(
-        "state can be cloned, mapped and forked", check_fork, "Keep all that the future depends on in State; nothing in the simulator."
+        "state can be cloned, mapped and forked",
+        check_fork,
+        "Keep all that the future depends on in State; nothing in the simulator.",
     ),
     CheckItem(
-        "state survives the run record", check_record, "Return plain tensors in State, in the simulator's type; see record_stage.py."
+        "state survives the run record",
+        check_record,
+        "Return plain tensors in State, in the simulator's type; see record_stage.py.",
     ),
-    CheckItem("2T steps are T steps twice", check_halves, "Something besides State survives between steps, or is lost at a rollout's end."),
-    CheckItem("a batch is a loop over worlds", check_batch, "Worlds mix: look for sums over the first axis and for shared buffers."),
-    CheckItem("deterministic where declared", check_determinism, "Order the sums, or take the device out of deterministic_devices."),
+    CheckItem(
+        "2T steps are T steps twice", check_halves, "Something besides State survives between steps, or is lost at a rollout's end."
+    ),
+    CheckItem(
+        "a batch is a loop over worlds", check_batch, "Worlds mix: look for sums over the first axis and for shared buffers."
+    ),
+    CheckItem(
+        "deterministic where declared", check_determinism, "Order the sums, or take the device out of deterministic_devices."
+    ),
     CheckItem("declared manipulator kinds run", check_kinds, "Implement the kind, or take it out of manipulator_kinds."),
     CheckItem(
-        "capabilities hold", check_capabilities, "Call Simulator.__init__, which compares with the declared capabilities; correct those."
+        "capabilities hold",
+        check_capabilities,
+        "Call Simulator.__init__, which compares with the declared capabilities; correct those.",
     ),
     CheckItem("bad arguments are named", check_errors, "Call Simulator.check_inputs first in rollout; raise InputError in vjp."),
 )

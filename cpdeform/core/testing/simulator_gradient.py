@@ -27,17 +27,18 @@ from cpdeform.core.testing.simulator_bench import (
 )
 
 STEPS = {
-    "actions": (1e-6, 2e-2),
+    "actions": (1e-6, 2e-3),
     "position": (1e-8, 1e-5),
     "velocity": (1e-6, 1e-2),
     "affine": (1e-5, 1e-1),
     "elastic_strain": (1e-8, 1e-4),
-    "manipulator_pose": (1e-8, 1e-4),
+    "manipulator_pose": (1e-8, 1e-5),
 }
 """Step of the differences in double and single precision, in the unit of each input."""
 
-DOUBLE_BOUND, SINGLE_BOUND = 2e-4, 0.1
-"""Largest error of a slope, in units of the slope that a random direction typically has."""
+DOUBLE_BOUND, SINGLE_BOUND = 2e-4, 0.5
+"""Largest error of a slope, in units of the slope that a random direction typically has. That along the gradient is sqrt(n) times
+as large for n numbers, so that the wide bound of single precision still sees a gradient that is too long by a percent or so."""
 
 
 class _Probe:
@@ -159,7 +160,9 @@ def check_gradients_from_rest(bench: SimulatorBench) -> Finding:
             scene = resting({**tool, "position": (x, y if height is None else height, z)}, gravity_parameter=(0.0, 0.0, 0.0))
             simulator = bench.make(scene)
             trajectory = simulator.rollout(simulator.initial_state(), no_actions(simulator))
-            gradient = simulator.vjp(trajectory, torch.ones_like(trajectory.positions), torch.ones_like(trajectory.manipulator_poses))
+            gradient = simulator.vjp(
+                trajectory, torch.ones_like(trajectory.positions), torch.ones_like(trajectory.manipulator_poses)
+            )
             complaints += [f"{name}: {kind}" for name in _not_finite(gradient)]
     if not kinds:
         raise Skip("It declares no kind of manipulator.")

@@ -1,0 +1,17 @@
+"""Registers the example backend."""
+
+from __future__ import annotations
+
+from cpdeform.core.hookspecs import PluginSpec, hookimpl
+
+
+@hookimpl
+def cpdeform_simulators() -> list[PluginSpec]:
+    """Register the simulator `example`."""
+    return [
+        PluginSpec(
+            name="example",
+            target="cpdeform_example.simulator:SimulatorExample",
+            summary="MLS-MPM in plain PyTorch, CPU, gradients by autograd; slow, for tests and as a tutorial",
+        )
+    ]
