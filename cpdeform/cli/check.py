@@ -114,7 +114,8 @@ def check_golden_command(
     Exit code 0: all within tolerance; 1: one is not, or is not supported; 2: unusable input.
     """
     from cpdeform.core.plugins import load_registry, split_options
-    from cpdeform.core.testing.golden import check_golden_file, golden_files
+    from cpdeform.core.testing.golden import check_golden_file
+    from cpdeform.core.testing.golden_file import golden_files
 
     factory = functools.partial(load_registry().load("simulator", backend), **split_options(settings or []))
     real, results = _dtype(dtype), []

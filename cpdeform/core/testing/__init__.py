@@ -10,7 +10,8 @@ On the command line: ``cpdeform check simulator NAME``.
 
 from __future__ import annotations
 
-from cpdeform.core.testing.golden import Golden, GoldenErrors, check_golden_file, compare_golden, golden_files, read_golden
+from cpdeform.core.testing.golden import GoldenErrors, check_golden_file, compare_golden
+from cpdeform.core.testing.golden_file import Golden, golden_files, read_golden
 from cpdeform.core.testing.ot import check_ot_solver
 from cpdeform.core.testing.placer import check_placer
 from cpdeform.core.testing.report import Check, CheckError, Report

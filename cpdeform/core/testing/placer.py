@@ -58,7 +58,7 @@ def make_stage(*, dtype: torch.dtype = torch.float64, fixed: bool = False, **cha
         fixed: Whether a fixed ball comes before and after the movable one in the order of the tools.
         changes: Fields of the movable ball.
     """
-    body = {"kind": "box", "position": (0.5, 0.06, 0.5), "widths": (0.16, 0.1, 0.12), "particle_count": 300}
+    body = {"kind": "box", "position": (0.5, 0.06, 0.5), "widths": (0.16, 0.1, 0.12), "particle_count": 200}
     ball = {
         "kind": "Sphere",
         "radius": 0.03,
@@ -127,7 +127,7 @@ def check_collision(bench: PlacerBench) -> Finding:
 def check_bounds(bench: PlacerBench) -> Finding:
     """How far a tool is out of its bounds."""
     outside = [0.0]
-    for seed in range(3):
+    for seed in range(2):
         for item in bench.make().ask(reseeded(bench.stage, seed)):
             for index, tool in enumerate(bench.stage.scene.manipulators):
                 position = item.pose[index, :3].double().cpu()

@@ -173,9 +173,8 @@ def check_determinism(bench: SimulatorBench) -> Finding:
     simulator = bench.make(bench.scene, batch_size=2)
     state, actions = stirred(simulator, batch_size=2), random_actions(simulator, batch_size=2)
     first, second = simulator.rollout(state, actions), simulator.rollout(state, actions)
-    return Finding(
-        max(largest_difference(first.positions, second.positions), state_difference(first.final_state, second.final_state)), 0.0
-    )
+    moments = largest_difference(first.positions, second.positions)
+    return Finding(max(moments, state_difference(first.final_state, second.final_state)), 0.0)
 
 
 def check_capabilities(bench: SimulatorBench) -> Finding:
@@ -207,7 +206,7 @@ def check_capabilities(bench: SimulatorBench) -> Finding:
 def _memory_complaints(bench: SimulatorBench) -> list[str]:
     estimates = [bench.make(bench.scene).memory_estimate(steps) for steps in (1, 20)]
     grows = all(isinstance(estimate, int) for estimate in estimates) and 0 < estimates[0] <= estimates[1]
-    return [] if grows else [f"memory_estimate(1), (20) are {estimates}, not positive numbers of bytes that grow"]
+    return [] if grows else [f"memory_estimate(1), (20) are {estimates}, not numbers of bytes that grow"]
 
 
 def _undeclared_kinds(bench: SimulatorBench) -> list[str]:
@@ -244,8 +243,7 @@ def check_errors(bench: SimulatorBench) -> Finding:
     """Inputs that do not fit raise `InputError` with the argument's name."""
     simulator = bench.make(default_scene(bench.capabilities.manipulator_kinds[:1]))
     state, actions = simulator.initial_state(), random_actions(simulator)
-    steps, size = actions.shape[1:]
-    wide = torch.zeros(1, steps, size + 1).to(actions)
+    wide = torch.cat([actions, actions[..., :1]], dim=-1)
     fewer = State(**{field.name: getattr(state, field.name)[:, :-1] for field in dataclasses.fields(State)})
     fewer = dataclasses.replace(fewer, manipulator_pose=state.manipulator_pose)
     more = dataclasses.replace(state, manipulator_pose=torch.cat([state.manipulator_pose, torch.zeros(1, 1, 8).to(actions)], dim=1))
