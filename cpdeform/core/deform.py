@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 
@@ -64,26 +65,18 @@ def deform(
         CapabilityError: The parts do not fit together.
     """
     registry = registry or load_registry()
-    task = load_task(task, registry=registry) if isinstance(task, str) else task
-    defaults = RunConfiguration()
     for kind, part in (("simulator", simulator), ("ot_solver", ot_solver), ("placer", placer)):
         if isinstance(part, str):
             registry.find(kind, part)
-    names = {
-        kind: part if isinstance(part, str) else type(part).__name__
-        for kind, part in (("backend", simulator), ("ot", ot_solver), ("placer", placer))
-    }
-    used_placer: Placer = registry.create("placer", placer) if isinstance(placer, str) else placer
-    used_simulator: Simulator = (
-        registry.create("simulator", simulator, scene=task.scene, batch_size=MAX_WORLDS, device=device)
-        if isinstance(simulator, str)
-        else simulator
-    )
+    task = load_task(task, registry=registry) if isinstance(task, str) else task
+    defaults = RunConfiguration()
+    names = {"backend": _part_name(simulator), "ot": _part_name(ot_solver), "placer": _part_name(placer)}
+    used_placer: Placer = _part(placer, "placer", registry)
+    options = {"scene": task.scene, "batch_size": MAX_WORLDS, "device": device}
+    used_simulator: Simulator = _part(simulator, "simulator", registry, **options)
     if objective is None:
         objective = transport_objective(task, ot_solver, used_simulator, options=defaults.objective, registry=registry)
-    used_solver: OTSolver = (
-        registry.create("ot_solver", ot_solver, blur=defaults.priorities.blur) if isinstance(ot_solver, str) else ot_solver
-    )
+    used_solver: OTSolver = _part(ot_solver, "ot_solver", registry, blur=defaults.priorities.blur)
     planner = Planner(
         task=task,
         simulator=used_simulator,
@@ -96,6 +89,15 @@ def deform(
         names=names,
     )
     return planner.run(stages=stages, state=state)
+
+
+def _part_name(part: object) -> str:
+    return part if isinstance(part, str) else type(part).__name__
+
+
+def _part(part: Any, kind: str, registry: Registry, **options: Any) -> Any:
+    """A part given as an object, or the one that a name stands for, created with options."""
+    return registry.create(kind, part, **options) if isinstance(part, str) else part
 
 
 def deform_configuration(
@@ -188,7 +190,7 @@ def transport_objective(
         registry: Where the name is looked up.
         options: Subset size, blur, refresh schedule, contact weight.
     """
-    solver: OTSolver = registry.create("ot_solver", ot_solver, blur=options.blur) if isinstance(ot_solver, str) else ot_solver
+    solver: OTSolver = _part(ot_solver, "ot_solver", registry, blur=options.blur)
     target = torch.as_tensor(task.load_target()).to(device=simulator.device, dtype=simulator.dtype)
     return ObjectiveTransport(
         solver,

@@ -24,6 +24,11 @@ class Particles:
     affine: Any
     strain: Any
 
+    @property
+    def arrays(self) -> tuple[Any, Any, Any, Any]:
+        """All four, in the order of the kernels' arguments."""
+        return (self.position, self.velocity, self.affine, self.strain)
+
 
 @dataclasses.dataclass(frozen=True)
 class Substep:
@@ -137,50 +142,20 @@ class Lane:
         grid = self._zeros(self.blocks * self.worlds, nodes)
         velocity = wp.empty((self.worlds, nodes), dtype=types.vec4, device=program.device)
         after = Particles(self._empty(types.vec3), self._empty(types.vec3), self._empty(types.mat33), self._empty(types.vec6))
+        tools, box = (poses, program.tools, program.parameters, frame), (origin, size)
+        matter = (*particles.arrays, program.constants, program.parameters)
+        moved = (after.position, after.velocity, after.affine)
 
         def scatter(block: int, first: int, count: int) -> None:
-            self._launch(
-                kernels.particles_to_grid,
-                count,
-                [
-                    particles.position,
-                    particles.velocity,
-                    particles.affine,
-                    particles.strain,
-                    program.constants,
-                    program.parameters,
-                    first,
-                    block * self.worlds,
-                    origin,
-                    size,
-                    after.strain,
-                    grid,
-                ],
-            )
+            row = block * self.worlds
+            self._launch(kernels.particles_to_grid, count, (*matter, first, row, *box, after.strain, grid))
 
         def update(block: int, first: int, count: int) -> None:
-            self._launch(
-                kernels.update_grid,
-                count,
-                [grid, self.blocks, poses, program.tools, program.parameters, frame, first, origin, size, velocity],
-            )
+            self._launch(kernels.update_grid, count, (grid, self.blocks, *tools, first, *box, velocity))
 
         def gather(block: int, first: int, count: int) -> None:
-            self._launch(
-                kernels.grid_to_particles,
-                count,
-                [
-                    particles.position,
-                    velocity,
-                    program.parameters,
-                    first,
-                    origin,
-                    size,
-                    after.position,
-                    after.velocity,
-                    after.affine,
-                ],
-            )
+            inputs = (particles.position, velocity, program.parameters, first, *box, *moved)
+            self._launch(kernels.grid_to_particles, count, inputs)
 
         self._spread(self.particle_count, scatter)
         self._spread(nodes, update)
@@ -199,79 +174,29 @@ class Lane:
             grad_poses: Gradient (blocks * W, frames, tools) with respect to the poses; added to.
         """
         program, kernels = self.program, self.program.kernels
-        before, origin, size = substep.particles, substep.origin, substep.size
-        nodes = substep.grid.shape[1]
+        before, grid, box = substep.particles, substep.grid, (substep.origin, substep.size)
+        nodes = grid.shape[1]
         velocity = wp.empty((self.worlds, nodes), dtype=program.types.vec4, device=program.device)
         grad_grid = self._zeros(self.blocks * self.worlds, nodes)
+        tools = (poses, program.tools, program.parameters, frame)
+        matter = (*before.arrays, program.constants, program.parameters)
+        moved = (gradient.position, gradient.velocity, gradient.affine)
 
         def update(block: int, first: int, count: int) -> None:
-            self._launch(
-                kernels.update_grid,
-                count,
-                [substep.grid, 1, poses, program.tools, program.parameters, frame, first, origin, size, velocity],
-            )
+            self._launch(kernels.update_grid, count, (grid, 1, *tools, first, *box, velocity))
 
         def scatter(block: int, first: int, count: int) -> None:
-            self._launch(
-                kernels.grid_to_particles_adjoint,
-                count,
-                [
-                    before.position,
-                    velocity_after,
-                    velocity,
-                    program.parameters,
-                    first,
-                    block * self.worlds,
-                    origin,
-                    size,
-                    gradient.position,
-                    gradient.velocity,
-                    gradient.affine,
-                    grad_grid,
-                ],
-            )
+            row = block * self.worlds
+            start = (before.position, velocity_after, velocity, program.parameters)
+            self._launch(kernels.grid_to_particles_adjoint, count, (*start, first, row, *box, *moved, grad_grid))
 
         def update_adjoint(block: int, first: int, count: int) -> None:
-            self._launch(
-                kernels.update_grid_adjoint,
-                count,
-                [
-                    substep.grid,
-                    self.blocks,
-                    poses,
-                    program.tools,
-                    program.parameters,
-                    frame,
-                    first,
-                    origin,
-                    size,
-                    grad_grid,
-                    block,
-                    grad_poses,
-                ],
-            )
+            inputs = (grid, self.blocks, *tools, first, *box, grad_grid, block, grad_poses)
+            self._launch(kernels.update_grid_adjoint, count, inputs)
 
         def gather(block: int, first: int, count: int) -> None:
-            self._launch(
-                kernels.particles_to_grid_adjoint,
-                count,
-                [
-                    before.position,
-                    before.velocity,
-                    before.affine,
-                    before.strain,
-                    program.constants,
-                    program.parameters,
-                    first,
-                    origin,
-                    size,
-                    grad_grid,
-                    gradient.position,
-                    gradient.velocity,
-                    gradient.affine,
-                    gradient.strain,
-                ],
-            )
+            inputs = (*matter, first, *box, grad_grid, *gradient.arrays)
+            self._launch(kernels.particles_to_grid_adjoint, count, inputs)
 
         self._spread(nodes, update)
         self._spread(self.particle_count, scatter)

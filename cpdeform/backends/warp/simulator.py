@@ -205,8 +205,7 @@ class SimulatorWarp(Simulator):
             kept.append(records)
             positions[worlds, step + 1] = wp.to_torch(particles.position)
         targets = (final.position, final.velocity, final.affine, final.elastic_strain)
-        sources = (particles.position, particles.velocity, particles.affine, particles.strain)
-        for target, source in zip(targets, sources, strict=True):
+        for target, source in zip(targets, particles.arrays, strict=True):
             target[worlds] = wp.to_torch(source).reshape(target[worlds].shape)
         return _LaneCheckpoints(worlds, view, tuple(starts), tuple(kept), particles)
 
