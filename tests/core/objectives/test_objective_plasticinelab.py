@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from golden import NAMES, golden_path
 from scipy.spatial import cKDTree
 
 from cpdeform.core.errors import InputError
@@ -18,18 +15,11 @@ from cpdeform.core.objectives.plasticinelab import ObjectivePlasticineLab, mass_
 from cpdeform.core.scene import BodyBox, ManipulatorSphere, Scene
 from cpdeform.core.simulator import Trajectory
 from cpdeform.core.state import initial_state
+from cpdeform.core.testing import read_golden
+from cpdeform.core.testing.golden_file import recorded_poses
 
-SHARED = Path(os.environ.get("CPDEFORM_SHARED", Path(__file__).resolve().parents[4] / "shared"))
-GOLDEN = {
-    "assembly-v2": ("assembly", "Assembly3D-v2"),
-    "move-v2": ("move", "Move3D-v2"),
-    "pinch-v2": ("pinch", "Pinch3D-v2"),
-    "rope-v2": ("rope", "Rope3D-v2"),
-    "table-v2": ("table", "Table3D-v2"),
-    "torus-v2": ("torus", "Torus3D-v2"),
-    "triplemove-v2": ("triple-move", "TripleMove3D-v2"),
-    "writer-v2": ("writer", "Writer3D-v2"),
-}
+WITH_TARGET = [name for name in NAMES if not name.startswith("multistage_")]
+"""Recordings whose target grid was published."""
 
 
 def small_scene() -> Scene:
@@ -103,27 +93,13 @@ def test_unusable_targets_are_named() -> None:
         ObjectivePlasticineLab(small_scene(), -target())
 
 
-def load(name: str) -> tuple[dict[str, np.ndarray], Scene, torch.Tensor]:
-    if not (SHARED / "golden").is_dir():
-        pytest.skip(f"no recorded trajectories in {SHARED}; set CPDEFORM_SHARED to the folder that holds golden/")
-    scene_name, grid_name = GOLDEN[name]
-    fields = json.loads((SHARED / "plasticinelab" / "scenes.json").read_text())[scene_name]
-    fields.pop("variants", None)
-    scene = Scene.model_validate(fields)
-    with np.load(SHARED / "golden" / f"{name}-seed0.npz") as file:
-        recorded = {key: file[key] for key in file}
-    goal = np.zeros((64, 64, 64))
-    with np.load(SHARED / "plasticinelab" / "target_grids.npz") as file:
-        goal[tuple(file[f"{grid_name}/cells"].T)] = file[f"{grid_name}/count"] * scene.particle_volume
-    return recorded, scene, torch.as_tensor(goal)
-
-
-@pytest.mark.parametrize("name", GOLDEN)
+@pytest.mark.parametrize("name", WITH_TARGET)
 def test_terms_and_metrics_equal_plasticinelabs(name: str) -> None:
-    recorded, scene, goal = load(name)
+    golden = read_golden(golden_path(name))
+    recorded, scene, goal = golden.arrays, golden.scene, golden.target_grid
+    assert goal is not None
     positions = torch.as_tensor(recorded["x"])
-    poses = torch.zeros(len(scene.manipulators), 8, dtype=torch.float64)
-    poses[:, :7] = torch.as_tensor(recorded["prim"][-1]).reshape(-1, 7)
+    poses = recorded_poses(scene, recorded["prim"])[-1]
     terms = ObjectivePlasticineLab(scene, goal).terms(positions, poses)
     # The published grids are float32, hence the tolerance on all that depends on the target's masses.
     assert float(terms["density"]) == pytest.approx(recorded["density"][-1], rel=1e-7)
