@@ -4,18 +4,24 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+NATIVE := $(VENV)/.native
+NATIVE_SOURCES := $(shell find plugins/cpdeform-native -name '*.cpp' -o -name '*.h' -o -name CMakeLists.txt -o -name pyproject.toml)
+COMPILER := $(shell command -v $${CXX:-c++} 2>/dev/null)
 OUT ?= runs/first
 
 .PHONY: run test quick lint targets clean
 
-run: $(INSTALLED)
+run: $(NATIVE)
 	$(BIN)/cpdeform run writer --iterations 30 --out $(OUT) --overwrite
 
-test: $(INSTALLED)
+test: $(NATIVE)
 	$(BIN)/python -m pytest
 	cd plugins/cpdeform-example && ../../$(BIN)/python -m pytest
+ifneq ($(COMPILER),)
+	cd plugins/cpdeform-native && ../../$(BIN)/python -m pytest
+endif
 
-quick: $(INSTALLED)
+quick: $(NATIVE)
 	$(BIN)/python -m pytest -m "not slow"
 
 lint: $(INSTALLED)
@@ -23,6 +29,7 @@ lint: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	cd plugins/cpdeform-example && ../../$(BIN)/mypy
+	cd plugins/cpdeform-native && ../../$(BIN)/mypy
 
 targets: $(INSTALLED)
 	$(BIN)/python -m cpdeform.tasks.make_targets --check
@@ -33,6 +40,17 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-deps --editable plugins/cpdeform-example
 	touch $(INSTALLED)
+
+# The C++ simulator and transport solver. Without a compiler the other backends take their place.
+$(NATIVE): $(INSTALLED) $(NATIVE_SOURCES)
+ifeq ($(COMPILER),)
+	@echo "No C++ compiler was found: the native simulator and transport solver are not built; Warp and GeomLoss take their place."
+else
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt scikit-build-core nanobind cmake ninja
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pip install --quiet --no-build-isolation --no-deps --editable plugins/cpdeform-native \
+		|| echo "The native simulator and transport solver could not be built (see above); Warp and GeomLoss take their place."
+endif
+	touch $(NATIVE)
 
 clean:
 	rm -rf $(VENV)

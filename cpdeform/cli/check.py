@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -94,7 +95,7 @@ def check_placer_command(name: Name, settings: Settings = None, only: Only = Non
 @check.command("golden")
 def check_golden_command(
     directory: Annotated[Path, typer.Argument(help="Folder with golden files, e.g. torus-v2-seed0.npz.", metavar="DIR")],
-    backend: Annotated[str, typer.Option(help="Simulator.", metavar="NAME")] = "warp",
+    backend: Annotated[list[str] | None, typer.Option(help="Simulator; repeatable.  [default: warp]", metavar="NAME")] = None,
     scenes: Annotated[
         Path | None, typer.Option(help="Scene definitions.  [default: DIR/../plasticinelab/scenes.json]", metavar="FILE")
     ] = None,
@@ -107,35 +108,48 @@ def check_golden_command(
     allow_unsupported: Annotated[
         bool, typer.Option("--allow-unsupported", help="Scenes that the backend declares it cannot run do not count as failures.")
     ] = False,
+    markdown: Annotated[Path | None, typer.Option(help="Also write all errors as a Markdown page.", metavar="FILE")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object a file, and a last one with all.")] = False,
 ) -> None:
-    """Hold a backend against rollouts and gradients recorded from PlasticineLab, one line a file.
+    """Hold backends against rollouts and gradients recorded from PlasticineLab, one line a file.
 
     Exit code 0: all within tolerance; 1: one is not, or is not supported; 2: unusable input.
     """
+    from cpdeform.core.errors import InputError
     from cpdeform.core.plugins import load_registry, split_options
     from cpdeform.core.testing.golden import check_golden_file
     from cpdeform.core.testing.golden_file import golden_files
+    from cpdeform.experiments.golden_table import golden_command, golden_table
 
-    factory = functools.partial(load_registry().load("simulator", backend), **split_options(settings or []))
-    real, results = _dtype(dtype), []
-    for path in golden_files(directory):
+    if markdown is not None and not markdown.parent.is_dir():
+        raise InputError("--markdown", came=str(markdown), expected="a file in a folder that exists")
+    registry, real, names = load_registry(), _dtype(dtype), list(dict.fromkeys(backend or ["warp"]))
+    with _quietly(as_json):
+        simulators = {name: registry.load("simulator", name) for name in names}
+    results: dict[str, list[GoldenErrors]] = {name: [] for name in names}
+    for name, path in itertools.product(names, golden_files(directory)):
+        factory = functools.partial(simulators[name], **split_options(settings or []))
         with _quietly(as_json):
             result = check_golden_file(path, factory, scenes=scenes, targets=targets, device=device, dtype=real)
-        results.append(result)
-        typer.echo(json.dumps(_plain(result)) if as_json else str(result))
+        results[name].append(result)
+        prefix = f"{name:<10}" if len(names) > 1 else ""
+        typer.echo(json.dumps(_plain(name, result)) if as_json else f"{prefix}{result}")
+    if markdown is not None:
+        command = golden_command(names, device=device, dtype=dtype, settings=settings or [], out=markdown)
+        markdown.write_text(golden_table(results, command=command, device=device, registry=registry), encoding="utf-8")
     accepted = {"passed", "unsupported"} if allow_unsupported else {"passed"}
-    passed = all(result.status in accepted for result in results)
+    passed = all(result.status in accepted for found in results.values() for result in found)
     if as_json:
-        typer.echo(json.dumps({"backend": backend, "passed": passed, "files": [_plain(result) for result in results]}))
+        files = [_plain(name, result) for name, found in results.items() for result in found]
+        typer.echo(json.dumps({"backend": ",".join(names), "passed": passed, "files": files}))
     if not passed:
         raise typer.Exit(1)
 
 
-def _plain(result: GoldenErrors) -> dict[str, Any]:
+def _plain(backend: str, result: GoldenErrors) -> dict[str, Any]:
     from cpdeform.core.record_files import to_json
 
-    plain: dict[str, Any] = to_json(dataclasses.asdict(result))
+    plain: dict[str, Any] = to_json({"backend": backend, **dataclasses.asdict(result)})
     return plain
 
 

@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from cpdeform import __version__
+from cpdeform.cli.bench import bench
 from cpdeform.cli.check import check
 from cpdeform.cli.plugins import plugins
 from cpdeform.cli.run import run
@@ -51,6 +52,7 @@ app = typer.Typer(
 app.command()(run)
 app.command()(tasks)
 app.command()(plugins)
+app.add_typer(bench, name="bench")
 app.add_typer(check, name="check")
 
 

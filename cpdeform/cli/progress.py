@@ -7,8 +7,8 @@ import time
 from types import TracebackType
 
 import typer
+from rich import progress as rich_progress
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import Tensor
 
 from cpdeform.core.optimizer import Iteration
@@ -18,22 +18,39 @@ from cpdeform.core.task import Task
 SECONDS_BETWEEN_LINES = 15.0
 
 
-class ProgressBar(Observer):
+class Progress(Observer):
+    """What bar and lines have in common: they tell the memory that rollouts are about to need."""
+
+    _told = 0
+
+    def optimization_started(self, stage: int, worlds: int, memory_estimate: int) -> None:
+        """Print the memory estimate, unless it was told for no smaller a batch."""
+        if memory_estimate > self._told:
+            self._told = memory_estimate
+            self._print(f"memory: about {megabytes(memory_estimate)} for rollouts and gradients, worlds {worlds}")
+
+    def _print(self, line: str) -> None:
+        typer.echo(line, file=sys.stderr)
+
+
+class ProgressBar(Progress):
     """A bar with stage, iteration, loss, best loss and time left; for terminals. A context manager.
 
     Args:
         stages: Number of stages; the task's own where absent.
+        first_stage: Number of the first stage.
     """
 
-    def __init__(self, *, stages: int | None) -> None:
+    def __init__(self, *, stages: int | None, first_stage: int = 0) -> None:
         self._stages = stages
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+        self._first_stage = first_stage
+        self._progress = rich_progress.Progress(
+            rich_progress.TextColumn("{task.description}"),
+            rich_progress.BarColumn(),
+            rich_progress.TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+            rich_progress.TimeElapsedColumn(),
+            rich_progress.TextColumn("left"),
+            rich_progress.TimeRemainingColumn(),
             console=Console(stderr=True),
             transient=True,
         )
@@ -57,16 +74,19 @@ class ProgressBar(Observer):
             self._bar,
             visible=True,
             total=total,
-            completed=stage * iteration.count + iteration.index + 1,
-            description=f"stage {stage + 1}/{self._stages}  {_losses(iteration)}",
+            completed=(stage - self._first_stage) * iteration.count + iteration.index + 1,
+            description=f"stage {stage + 1}/{self._first_stage + (self._stages or 1)}  {_losses(iteration)}",
         )
 
     def stage_finished(self, result: StageResult) -> None:
         """Leave a line that stays."""
-        self._progress.console.print(_stage_line(result), highlight=False)
+        self._print(_stage_line(result))
+
+    def _print(self, line: str) -> None:
+        self._progress.console.print(line, highlight=False)
 
 
-class ProgressLines(Observer):
+class ProgressLines(Progress):
     """A line now and then and after each stage; for logs."""
 
     def __init__(self) -> None:
@@ -77,11 +97,16 @@ class ProgressLines(Observer):
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + SECONDS_BETWEEN_LINES
             text = f"stage {stage + 1}, iteration {iteration.index + 1}/{iteration.count}, {_losses(iteration)}"
-            typer.echo(text, file=sys.stderr)
+            self._print(text)
 
     def stage_finished(self, result: StageResult) -> None:
         """Print a line."""
-        typer.echo(_stage_line(result), file=sys.stderr)
+        self._print(_stage_line(result))
+
+
+def megabytes(count: int) -> str:
+    """Bytes as text, in megabytes of 1e6 bytes, or in gigabytes."""
+    return f"{count / 1e9:.2g} GB" if count >= 1e9 else f"{count / 1e6:.3g} MB"
 
 
 def _losses(iteration: Iteration) -> str:

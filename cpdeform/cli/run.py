@@ -15,8 +15,9 @@ import typer
 if TYPE_CHECKING:
     from cpdeform.core.configuration import RunConfiguration
     from cpdeform.core.plugins import Registry
-    from cpdeform.core.record import RunRecorder
+    from cpdeform.core.record import RunRecord, RunRecorder
     from cpdeform.core.result import DeformResult, Observer
+    from cpdeform.core.resume import Resumption
 
 FLAGS = {
     "task": "TASK",
@@ -35,8 +36,10 @@ SOURCE = "--set"
 
 def run(
     task: Annotated[str | None, typer.Argument(help="Name, e.g. writer-v2, or a YAML file.  [default: writer]")] = None,
-    backend: Annotated[str | None, typer.Option(help="Simulator.  [default: warp]", metavar="NAME")] = None,
-    ot: Annotated[str | None, typer.Option(help="Optimal-transport solver.  [default: geomloss]", metavar="NAME")] = None,
+    backend: Annotated[
+        str | None, typer.Option(help="Simulator; auto: the fastest installed.  [default: auto]", metavar="NAME")
+    ] = None,
+    ot: Annotated[str | None, typer.Option(help="Optimal-transport solver.  [default: auto]", metavar="NAME")] = None,
     placer: Annotated[str | None, typer.Option(help="Where tools are put.  [default: transport]", metavar="NAME")] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda.  [default: cpu]", metavar="NAME")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of first actions and random placements.  [default: 0]")] = None,
@@ -45,6 +48,10 @@ def run(
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Any other option, e.g. optimizer.learning_rate=0.05; repeatable.", metavar="KEY=VALUE"),
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(help="Go on from this run record: its last state, its task, its options under those given.", metavar="DIR"),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Directory of the run record.  [default: runs/<task>-<time>]", metavar="DIR")
@@ -55,31 +62,39 @@ def run(
 ) -> None:
     """Plan how the tools of a task turn its body into its goal, and record the run.
 
+    With --resume, TASK may be left out, and --stages counts further stages (those left of the recorded run, or else one).
+
     Exit code 0: a plan was found; 1: none was (the advice says what to try); 2: unusable input; 130: interrupted.
     """
     flags = (task, backend, ot, placer, device, seed, stages, iterations)
     given = {field: value for field, value in zip(FLAGS, flags, strict=True) if value is not None}
-    configuration = _configure(given, settings or [])
+    from cpdeform.core.deform import check_names, resolved
     from cpdeform.core.plugins import load_registry
 
+    configuration, resumption = _configure(given, settings or []), None
     registry = load_registry()
+    if resume is not None:
+        configuration, resumption = _resume(resume, given, settings or [], registry, out=out)
+    check_names(configuration, registry=registry)
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+        configuration = resolved(configuration, registry=registry)
         # Libraries print to stdout, too; a reader of the JSON must not see that.
-        result, directory = _execute(configuration, registry, out, overwrite=overwrite, silent=as_json)
+        result, directory = _execute(configuration, resumption, registry, out, overwrite=overwrite, silent=as_json)
         picture = None if no_pictures else _draw(directory)
     if as_json:
-        typer.echo(json.dumps(_summary(result, configuration, directory)))
+        typer.echo(json.dumps(_summary(result, configuration, directory, resumed_from=resume)))
     else:
-        _print_summary(result, directory, picture)
+        _print_summary(result, directory, picture, resumed_from=resume)
     if not _finished(result):
         raise typer.Exit(1)
 
 
-def _configure(given: dict[str, Any], settings: list[str]) -> RunConfiguration:
-    """Build the configuration of ``--set`` and, above it, the flags given."""
+def _configure(given: dict[str, Any], settings: list[str], record: RunRecord | None = None) -> RunConfiguration:
+    """Build the configuration of ``--set`` and, above it, the flags given; of a record, if any, below them."""
     from cpdeform.core.configuration import RunConfiguration
     from cpdeform.core.errors import InputError
     from cpdeform.core.plugins import split_options
+    from cpdeform.core.resume import resumed_values
     from cpdeform.core.task import merge, validate
 
     values = split_options(settings)
@@ -89,7 +104,7 @@ def _configure(given: dict[str, Any], settings: list[str]) -> RunConfiguration:
             continue
         values = merge(values, {group: {name: value}} if dot else {field: value})
     try:
-        return validate(RunConfiguration, values, source=SOURCE)
+        return validate(RunConfiguration, values if record is None else resumed_values(record, values), source=SOURCE)
     except InputError as error:
         field = error.argument.removeprefix(f"{SOURCE}: ")
         if field in given:
@@ -97,20 +112,50 @@ def _configure(given: dict[str, Any], settings: list[str]) -> RunConfiguration:
         raise
 
 
+def _resume(
+    directory: Path, given: dict[str, Any], settings: list[str], registry: Registry, *, out: Path | None
+) -> tuple[RunConfiguration, Resumption]:
+    """Read the record to go on from; the configuration of the new run is the record's under what is given."""
+    from cpdeform.core.errors import InputError
+    from cpdeform.core.plugins import split_options
+    from cpdeform.core.record import load_record
+    from cpdeform.core.resume import check_same_task, make_resumption
+
+    if out is not None and out.resolve() == directory.resolve():
+        raise InputError("--out", came="the directory of --resume", expected="another one, for the record of the stages to come")
+    record = load_record(directory)
+    task = given.get("task", split_options(settings).get("task"))
+    if task is not None:
+        check_same_task(record, task, registry=registry)
+    configuration = _configure(given, settings, record)
+    return configuration, make_resumption(record, configuration)
+
+
 def _execute(
-    configuration: RunConfiguration, registry: Registry, out: Path | None, *, overwrite: bool, silent: bool
+    configuration: RunConfiguration,
+    resumption: Resumption | None,
+    registry: Registry,
+    out: Path | None,
+    *,
+    overwrite: bool,
+    silent: bool,
 ) -> tuple[DeformResult, Path]:
     """Run with record and progress; the cheap checks come first, and nothing is written before all are passed."""
-    from cpdeform.core.deform import check_names, configured_task, deform_configuration
+    from cpdeform.core.deform import configured_task, deform_configuration
     from cpdeform.core.record import RunRecorder
 
-    check_names(configuration, registry=registry)
-    task = configured_task(configuration, registry=registry)
+    task = configured_task(configuration, registry=registry) if resumption is None else resumption.task
     task.load_target()
-    recorder = RunRecorder(out or _default_directory(task.name), configuration=configuration, overwrite=overwrite)
+    recorder = RunRecorder(
+        out or _default_directory(task.name),
+        configuration=configuration,
+        overwrite=overwrite,
+        resumed_from=None if resumption is None else resumption.record,
+    )
+    first_stage = 0 if resumption is None else resumption.first_stage
     try:
-        with recorder, _progress(configuration.stages, silent=silent) as observers:
-            result = deform_configuration(configuration, observers=[recorder, *observers], registry=registry)
+        with recorder, _progress(configuration.stages, first_stage, silent=silent) as observers:
+            result = deform_configuration(configuration, resumption=resumption, observers=[recorder, *observers], registry=registry)
     except KeyboardInterrupt as error:
         typer.echo(_interruption(recorder), err=True)
         raise typer.Exit(130) from error
@@ -135,14 +180,14 @@ def _default_directory(task: str) -> Path:
 
 
 @contextlib.contextmanager
-def _progress(stages: int | None, *, silent: bool) -> Iterator[list[Observer]]:
+def _progress(stages: int | None, first_stage: int, *, silent: bool) -> Iterator[list[Observer]]:
     """Observers that show the progress: none, a bar on a terminal, else lines."""
     from cpdeform.cli.progress import ProgressBar, ProgressLines
 
     if silent:
         yield []
     elif sys.stderr.isatty():
-        with ProgressBar(stages=stages) as bar:
+        with ProgressBar(stages=stages, first_stage=first_stage) as bar:
             yield [bar]
     else:
         yield [ProgressLines()]
@@ -166,9 +211,12 @@ def _finished(result: DeformResult) -> int:
     return sum(stage.actions is not None for stage in result.stages)
 
 
-def _summary(result: DeformResult, configuration: RunConfiguration, directory: Path) -> dict[str, Any]:
+def _summary(
+    result: DeformResult, configuration: RunConfiguration, directory: Path, *, resumed_from: Path | None
+) -> dict[str, Any]:
     from cpdeform.core.record_files import to_json
 
+    memory = result.memory
     summary = {
         "task": result.task.name,
         "backend": configuration.backend,
@@ -184,19 +232,29 @@ def _summary(result: DeformResult, configuration: RunConfiguration, directory: P
         "stages": _finished(result),
         "gradient_evaluations": result.gradient_evaluations,
         "seconds": result.seconds,
+        "memory_estimate_mb": None if memory is None else memory.estimate / 1e6,
+        "peak_memory_mb": None if memory is None or memory.peak is None else memory.peak / 1e6,
+        "resumed_from": None if resumed_from is None else str(resumed_from),
         "out": str(directory),
     }
     return {key: to_json(value) for key, value in summary.items()}
 
 
-def _print_summary(result: DeformResult, directory: Path, picture: Path | None) -> None:
+def _print_summary(result: DeformResult, directory: Path, picture: Path | None, *, resumed_from: Path | None) -> None:
+    from cpdeform.cli.progress import megabytes
+
     lines = [
         f"{result.task.name}: {result.status.value.replace('_', ' ')}",
         f"  loss     {result.loss_initial:.4g} -> {result.loss_final:.4g}",
         f"  metric   {result.metric_name.replace('_', ' ')} {result.metric_value:.4g}",
         f"  effort   {_finished(result)} stages, {result.gradient_evaluations} gradient evaluations, {result.seconds:.1f} s",
-        f"  record   {directory}",
     ]
+    if result.memory is not None and result.memory.peak is not None:
+        figures = f"{megabytes(result.memory.peak)} at the peak, {megabytes(result.memory.estimate)} estimated"
+        lines.append(f"  memory   {figures} (rollout and gradient, worlds {result.memory.worlds})")
+    if resumed_from is not None:
+        lines.append(f"  resumed  from {resumed_from}, at stage {result.stages[0].index + 1}")
+    lines.append(f"  record   {directory}")
     if picture is not None:
         lines.append(f"  picture  {picture}")
     if result.status.advice:

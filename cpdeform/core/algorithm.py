@@ -13,6 +13,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -59,36 +60,40 @@ class Planner:
     observers: tuple[Observer, ...] = ()
     names: dict[str, str] = dataclasses.field(default_factory=dict)
 
-    def run(self, *, stages: int | None = None, state: State | None = None) -> DeformResult:
+    def run(self, *, stages: int | None = None, state: State | None = None, first_stage: int = 0) -> DeformResult:
         """Run Algorithm 1.
 
         Args:
             stages: Number of stages; the task's own where absent.
             state: Where to start, a single world, e.g. the last state of a run record; the scene's start where absent.
+            first_stage: Number of the first stage: of one that goes on from a record, `RunRecord.next_stage`. With the seed it
+                determines the random numbers, so that a run that is resumed equals one that went through.
 
         Returns:
             Every stage, and how the run ended. A stage that fails ends the run; what came before is kept.
 
         Raises:
             CapabilityError: The parts do not fit together.
-            InputError: `stages` is below 1, the goal or `state` cannot be used, or a tool starts inside the body.
+            InputError: `stages` or `first_stage` is out of range, the goal or `state` cannot be used, or a tool starts inside the
+                body.
         """
         count = self.task.stage_count if stages is None else stages
         if count < 1:
             raise InputError("stages", came=str(count), expected="at least 1")
+        if first_stage < 0:
+            raise InputError("first_stage", came=str(first_stage), expected="0 or more")
         self._check()
         scene_start = self.simulator.initial_state(batch_size=1)
         check_tools_outside(self.task.scene, scene_start)
         state = scene_start if state is None else self._check_state(state)
         start = time.perf_counter()
         target = torch.as_tensor(self.task.load_target()).to(device=self.simulator.device, dtype=self.simulator.dtype)
-        generator = torch.Generator().manual_seed(self.seed)
         for observer in self.observers:
             observer.run_started(self.task, target, self.names, self.seed)
         results: list[StageResult] = []
         # "for each stage:"
-        for index in range(count):
-            result = self._stage(index, state, target, generator)
+        for index in range(first_stage, first_stage + count):
+            result = self._stage(index, state, target, stage_generator(self.seed, index))
             results.append(result)
             for observer in self.observers:
                 observer.stage_finished(result)
@@ -214,6 +219,9 @@ class Planner:
             part = placements[start : start + self.simulator.batch_size]
             worlds = state.fork(len(part)).with_manipulators(torch.stack([placement.pose for placement in part]))
             actions = first_actions[start : start + len(part)]
+            estimate = self.simulator.memory_estimate(self.task.step_count, worlds=len(part))
+            for observer in self.observers:
+                observer.optimization_started(index, len(part), estimate)
             self.objective.reset()
             found.append(
                 self.optimizer.minimize(self.simulator, worlds, actions, self.objective, on_iteration=self._notifier(index))
@@ -233,6 +241,13 @@ class Planner:
         trajectory = self.simulator.rollout(start, candidate.actions.unsqueeze(0))
         self.objective.reset()
         return trajectory, float(self.objective.evaluate(trajectory).loss[0])
+
+
+def stage_generator(seed: int, index: int) -> torch.Generator:
+    """Random numbers of the stage with the given number; they depend on nothing that happened before it."""
+    if index > 0:
+        seed = int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
+    return torch.Generator().manual_seed(seed)
 
 
 def check_tools_outside(scene: Scene, state: State) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.plugins import AUTO
 from cpdeform.core.scene import FrozenModel
 
 
@@ -19,6 +20,7 @@ class OptimizerConfiguration(FrozenModel):
     patience: int = Field(default=15, ge=1)
     tolerance: float = Field(default=1e-3, ge=0.0)
     initial_noise: float = Field(default=0.01, ge=0.0)
+    schedule: Literal["halving", "paper"] = "halving"
 
 
 class PrioritiesConfiguration(FrozenModel):
@@ -53,8 +55,8 @@ class RunConfiguration(FrozenModel):
 
     Attributes:
         task: Registered name or path of a YAML file.
-        backend: Registered name of the simulator.
-        ot: Registered name of the transport solver.
+        backend: Registered name of the simulator, or ``"auto"``: the fastest one that is installed.
+        ot: Registered name of the transport solver, or ``"auto"``.
         placer: Registered name of the placer.
         device: Where tensors live, ``"cpu"`` or ``"cuda"``.
         seed: Seed of first actions and random placements.
@@ -69,8 +71,8 @@ class RunConfiguration(FrozenModel):
     """
 
     task: str = "writer"
-    backend: str = "warp"
-    ot: str = "geomloss"
+    backend: str = AUTO
+    ot: str = AUTO
     placer: str = "transport"
     device: str = "cpu"
     seed: int = Field(default=0, ge=0)

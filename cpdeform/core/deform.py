@@ -16,11 +16,12 @@ from cpdeform.core.objectives.transport import ObjectiveTransport
 from cpdeform.core.optimizer import TrajectoryOptimizer
 from cpdeform.core.ot import OTSolver
 from cpdeform.core.placer import Placer
-from cpdeform.core.plugins import Registry, load_registry
+from cpdeform.core.plugins import AUTO, Registry, load_registry
 from cpdeform.core.result import DeformResult, Observer
+from cpdeform.core.resume import Resumption
 from cpdeform.core.simulator import Simulator
 from cpdeform.core.state import State
-from cpdeform.core.task import Task, load_task, merge, validate
+from cpdeform.core.task import Task, changed_task, load_task
 
 MAX_WORLDS = 8
 """Candidates that are solved as one batch; more are solved in several."""
@@ -29,8 +30,8 @@ MAX_WORLDS = 8
 def deform(
     task: Task | str = "writer",
     *,
-    simulator: Simulator | str = "warp",
-    ot_solver: OTSolver | str = "geomloss",
+    simulator: Simulator | str = AUTO,
+    ot_solver: OTSolver | str = AUTO,
     placer: Placer | str = "transport",
     objective: Objective | None = None,
     optimizer: TrajectoryOptimizer | None = None,
@@ -38,6 +39,7 @@ def deform(
     seed: int = 0,
     stages: int | None = None,
     state: State | None = None,
+    first_stage: int = 0,
     observers: Sequence[Observer] = (),
     registry: Registry | None = None,
 ) -> DeformResult:
@@ -45,8 +47,9 @@ def deform(
 
     Args:
         task: A task, a registered name, or the path of a YAML file.
-        simulator: A simulator of the task's scene, or a registered name.
-        ot_solver: A transport solver or a registered name; it gives the priorities and, unless `objective` is given, the loss.
+        simulator: A simulator of the task's scene, or a registered name; ``"auto"`` is the fastest one that is installed.
+        ot_solver: A transport solver or a registered name, or ``"auto"``; it gives the priorities and, unless `objective` is given,
+            the loss.
         placer: A placer or a registered name.
         objective: The loss; Wasserstein distance of the last step's particles to the goal where absent.
         optimizer: Finds actions; defaults to `TrajectoryOptimizer()`.
@@ -54,6 +57,7 @@ def deform(
         seed: Seed of first actions and random placements.
         stages: Number of stages; the task's own where absent.
         state: Where to start, a single world, e.g. the last state of a run record; the scene's start where absent.
+        first_stage: Number of the first stage: `RunRecord.next_stage` for a run that goes on from a record.
         observers: Told of every iteration and stage, in order; the plugins' observers come after them.
         registry: Where names are looked up; the installed plugins where absent.
 
@@ -65,9 +69,12 @@ def deform(
         CapabilityError: The parts do not fit together.
     """
     registry = registry or load_registry()
-    for kind, part in (("simulator", simulator), ("ot_solver", ot_solver), ("placer", placer)):
-        if isinstance(part, str):
-            registry.find(kind, part)
+    if isinstance(simulator, str):
+        simulator = registry.resolve("simulator", simulator, device=device)
+    if isinstance(ot_solver, str):
+        ot_solver = registry.resolve("ot_solver", ot_solver, device=device)
+    if isinstance(placer, str):
+        registry.find("placer", placer)
     task = load_task(task, registry=registry) if isinstance(task, str) else task
     defaults = RunConfiguration()
     names = {"backend": _part_name(simulator), "ot": _part_name(ot_solver), "placer": _part_name(placer)}
@@ -88,7 +95,7 @@ def deform(
         observers=(*observers, HookObserver(registry.manager)),
         names=names,
     )
-    return planner.run(stages=stages, state=state)
+    return planner.run(stages=stages, state=state, first_stage=first_stage)
 
 
 def _part_name(part: object) -> str:
@@ -103,6 +110,7 @@ def _part(part: Any, kind: str, registry: Registry, **options: Any) -> Any:
 def deform_configuration(
     configuration: RunConfiguration,
     *,
+    resumption: Resumption | None = None,
     observers: Sequence[Observer] = (),
     registry: Registry | None = None,
 ) -> DeformResult:
@@ -110,6 +118,7 @@ def deform_configuration(
 
     Args:
         configuration: Names and options of all parts.
+        resumption: The run to go on with, see `cpdeform.core.resume`; the configuration's task from its start where absent.
         observers: Told of every iteration and stage, in order; the plugins' observers come after them.
         registry: Where names are looked up; the installed plugins where absent.
 
@@ -122,7 +131,8 @@ def deform_configuration(
     """
     registry = registry or load_registry()
     check_names(configuration, registry=registry)
-    task = configured_task(configuration, registry=registry)
+    configuration = resolved(configuration, registry=registry)
+    task = configured_task(configuration, registry=registry) if resumption is None else resumption.task
     placer = registry.create("placer", configuration.placer, **configuration.placer_options)
     simulator_options = {"batch_size": MAX_WORLDS, **configuration.simulator_options}
     simulator = registry.create(
@@ -142,7 +152,24 @@ def deform_configuration(
         observers=(*observers, HookObserver(registry.manager)),
         names={"backend": configuration.backend, "ot": configuration.ot, "placer": configuration.placer},
     )
-    return planner.run(stages=configuration.stages)
+    if resumption is None:
+        return planner.run(stages=configuration.stages)
+    return planner.run(stages=configuration.stages, state=resumption.state, first_stage=resumption.first_stage)
+
+
+def resolved(configuration: RunConfiguration, *, registry: Registry) -> RunConfiguration:
+    """The configuration with the names that ``"auto"`` stands for in its place.
+
+    Raises:
+        UnknownNameError: No plugin registers one of the names.
+        PluginError: Nothing is installed that ``"auto"`` could stand for.
+    """
+    device = configuration.device
+    names = {
+        "backend": registry.resolve("simulator", configuration.backend, device=device),
+        "ot": registry.resolve("ot_solver", configuration.ot, device=device),
+    }
+    return configuration.model_copy(update=names)
 
 
 def check_names(configuration: RunConfiguration, *, registry: Registry) -> None:
@@ -153,7 +180,8 @@ def check_names(configuration: RunConfiguration, *, registry: Registry) -> None:
         InputError: An option of the simulator belongs elsewhere.
     """
     for kind, name in (("simulator", configuration.backend), ("ot_solver", configuration.ot), ("placer", configuration.placer)):
-        registry.find(kind, name)
+        if name != AUTO:
+            registry.find(kind, name)
     for option, place in (("scene", "scene.<field>"), ("device", "device")):
         if option in configuration.simulator_options:
             remedy = f"Set {place} instead."
@@ -166,11 +194,7 @@ def configured_task(configuration: RunConfiguration, *, registry: Registry) -> T
     Raises:
         InputError: The task or a change cannot be used.
     """
-    task = load_task(configuration.task, registry=registry)
-    if not configuration.scene:
-        return task
-    changed = merge(task.model_dump(), {"scene": configuration.scene})
-    return validate(Task, changed, source=f"task {task.name} with --set")
+    return changed_task(load_task(configuration.task, registry=registry), scene=configuration.scene)
 
 
 def transport_objective(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import pluggy
@@ -23,12 +24,15 @@ class PluginSpec:
         target: ``"module:attribute"`` of the class (of the YAML file for a task: ``"module:file.yaml"``), imported on use.
         summary: One line for listings.
         extra: What to install when the target's imports are missing, e.g. ``"cpdeform[warp]"``.
+        automatic: Device types on which the name ``"auto"`` may stand for this part, each with a rank: of the parts that can be
+            imported the one with the highest rank is taken. The built-in parts have ranks up to 10.
     """
 
     name: str
     target: str
     summary: str
     extra: str = ""
+    automatic: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
 
 @hookspec

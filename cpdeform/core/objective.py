@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -35,6 +36,9 @@ class Objective(abc.ABC):
 
     def reset(self) -> None:  # noqa: B027 - most objectives keep nothing
         """Forget what was kept between calls (warm starts); called when a stage begins."""
+
+    def keep(self, worlds: Sequence[int]) -> None:  # noqa: B027 - most objectives keep nothing
+        """From now on a batch holds just these worlds of the previous one, in this order; for warm starts."""
 
 
 class ObjectiveAutograd(Objective):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 
@@ -10,9 +12,16 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.memory import MemoryGauge, MemoryUse
 from cpdeform.core.objective import Objective
-from cpdeform.core.simulator import Simulator
+from cpdeform.core.simulator import Simulator, Trajectory
 from cpdeform.core.state import State
+
+SCHEDULES = ("halving", "paper")
+"""How iterations are shared out among worlds; see `TrajectoryOptimizer.schedule`."""
+
+LEAST_ITERATIONS = 5
+"""No world is dropped before: the first losses are those of tools that have hardly moved."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,9 +31,11 @@ class Iteration:
     Attributes:
         index: Number of the iteration, from 0.
         count: Number of iterations planned.
-        loss: Loss (B,) of the actions tried, objective units; nan where the world's rollout was not finite.
+        loss: Loss (B,) of the actions tried, objective units; nan where the world's rollout was not finite or was not computed
+            because the world was dropped.
         best_loss: Lowest loss (B,) so far.
         seconds: Wall time of the parts `rollout`, `objective`, `vjp` and `optimizer`.
+        memory: Memory of rollout and gradient; measured in one iteration, after the first if there are several, else None.
     """
 
     index: int
@@ -32,6 +43,7 @@ class Iteration:
     loss: Tensor
     best_loss: Tensor
     seconds: dict[str, float]
+    memory: MemoryUse | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +54,7 @@ class OptimizationResult:
         actions: Best actions (B, T, A) of each world, in [-1, 1].
         loss: Their loss (B,), objective units; infinity where no evaluation was finite.
         finite: Worlds (B,) whose every loss and gradient were finite.
-        gradient_evaluations: Worlds times iterations evaluated.
+        gradient_evaluations: Gradients computed, of all worlds together.
         history: Every iteration, in order.
     """
 
@@ -63,6 +75,11 @@ class TrajectoryOptimizer:
         patience: Stop when no world improved by `tolerance` for this many iterations.
         tolerance: Smallest relative improvement of the loss that counts.
         initial_noise: Standard deviation of the first actions about zero, so that seeds differ.
+        schedule: ``"halving"`` drops the worse half of a batch's worlds again and again, so that a single one is left for the last
+            half of the iterations (successive halving [1]_); ``"paper"`` gives all worlds all iterations.
+
+    References:
+        .. [1] Jamieson, Talwalkar, "Non-stochastic Best Arm Identification and Hyperparameter Optimization", AISTATS 2016.
     """
 
     iterations: int = 40
@@ -70,6 +87,7 @@ class TrajectoryOptimizer:
     patience: int = 15
     tolerance: float = 1e-3
     initial_noise: float = 0.01
+    schedule: str = "halving"
 
     def __post_init__(self) -> None:
         limits = {"iterations": self.iterations >= 1, "learning_rate": self.learning_rate > 0, "patience": self.patience >= 1}
@@ -79,6 +97,8 @@ class TrajectoryOptimizer:
         for name in ("tolerance", "initial_noise"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"optimizer.{name}", came=str(getattr(self, name)), expected="zero or more")
+        if self.schedule not in SCHEDULES:
+            raise InputError("optimizer.schedule", came=repr(self.schedule), expected=f"one of {', '.join(SCHEDULES)}")
 
     def initial_actions(self, shape: tuple[int, int, int], generator: torch.Generator) -> Tensor:
         """First actions (B, T, A): small Gaussian noise, clipped to [-1, 1]."""
@@ -103,58 +123,108 @@ class TrajectoryOptimizer:
             on_iteration: Called after each iteration.
 
         Returns:
-            The best plan of each world. A world whose loss or gradient is not finite keeps its best plan so far and stops.
+            The best plan of each world. A world whose loss or gradient is not finite, or that the schedule drops, keeps its best
+            plan so far and stops.
         """
+        count = state.batch_size
         tried = actions.detach().clone().to(state.position).requires_grad_()
         adam = torch.optim.Adam([tried], lr=self.learning_rate)
         best_actions = tried.detach().clone()
-        best_loss = torch.full((state.batch_size,), torch.inf, dtype=torch.float64)
+        best_loss = torch.full((count,), torch.inf, dtype=torch.float64)
         reference = best_loss.clone()
-        alive = torch.ones(state.batch_size, dtype=torch.bool)
+        finite = torch.ones(count, dtype=torch.bool)
+        active, evaluations = torch.arange(count), 0
         history: list[Iteration] = []
         since_improvement = 0
         for index in range(self.iterations):
-            loss, gradient, seconds = _evaluate(simulator, state, tried.detach(), objective)
-            alive &= torch.isfinite(loss) & torch.isfinite(gradient).flatten(1).all(dim=1).cpu()
+            gauge = _gauge(simulator) if index == min(1, self.iterations - 1) else None
+            found, gradient, seconds = _evaluate(
+                simulator, _worlds(state, active), tried.detach()[active.to(tried.device)], objective, gauge
+            )
+            evaluations += len(active)
+            loss = torch.full_like(best_loss, torch.nan).index_copy(0, active, found)
+            finite[active] &= torch.isfinite(found) & torch.isfinite(gradient).flatten(1).all(dim=1).cpu()
             better = torch.isfinite(loss) & (loss < best_loss)
             best_loss = torch.where(better, loss, best_loss)
             best_actions[better.to(best_actions.device)] = tried.detach()[better.to(tried.device)]
             start = time.perf_counter()
-            keep = alive.to(gradient.device)[:, None, None]
-            tried.grad = torch.where(keep, gradient, torch.zeros_like(gradient))
-            adam.step()
-            with torch.no_grad():
-                tried.clamp_(-1.0, 1.0)
-                tried.copy_(torch.where(keep, tried, best_actions))
+            going = torch.zeros_like(finite)
+            going[active] = finite[active]
+            _step(adam, tried, gradient, active, going, best_actions)
             seconds["optimizer"] = time.perf_counter() - start
-            history.append(Iteration(index, self.iterations, loss, best_loss.clone(), seconds))
+            memory = None if gauge is None else _memory_use(simulator, tried[active.to(tried.device)], gauge)
+            history.append(Iteration(index, self.iterations, loss, best_loss.clone(), seconds, memory))
             if on_iteration is not None:
                 on_iteration(history[-1])
             improved = best_loss < torch.where(torch.isfinite(reference), reference - self.tolerance * reference.abs(), reference)
             reference = torch.where(improved, best_loss, reference)
             since_improvement = 0 if bool(improved.any()) else since_improvement + 1
-            if since_improvement >= self.patience or not bool(alive.any()):
+            survivors = self._survivors(active[finite[active]], best_loss, index + 1)
+            if since_improvement >= self.patience or not len(survivors):
                 break
-        return OptimizationResult(best_actions, best_loss, alive, state.batch_size * len(history), tuple(history))
+            if len(survivors) < len(active):
+                objective.keep([active.tolist().index(world) for world in survivors.tolist()])
+                active = survivors
+        return OptimizationResult(best_actions, best_loss, finite, evaluations, tuple(history))
+
+    def _survivors(self, active: Tensor, best_loss: Tensor, done: int) -> Tensor:
+        """Which worlds go on after `done` iterations, in order."""
+        if self.schedule == "paper" or len(active) < 2:
+            return active
+        rounds = math.ceil(math.log2(len(best_loss)))
+        # after 1/2^rounds of the iterations half of the worlds go, ..., after half of them all but one
+        passed = sum(done >= max(self.iterations / 2**rung, LEAST_ITERATIONS) for rung in range(1, rounds + 1))
+        room = max(1, math.ceil(len(best_loss) / 2**passed))
+        return active[best_loss[active].argsort(stable=True)[:room]].sort().values
 
 
-def _evaluate(simulator: Simulator, state: State, actions: Tensor, objective: Objective) -> tuple[Tensor, Tensor, dict[str, float]]:
-    """Loss (B,) in float64 on the CPU, gradient (B, T, A) and wall times of one evaluation."""
+def _worlds(state: State, active: Tensor) -> State:
+    """The active worlds of a state."""
+    index = active.to(state.position.device)
+    return state if len(active) == state.batch_size else state.map(lambda tensor: tensor[index])
+
+
+def _step(adam: torch.optim.Adam, tried: Tensor, gradient: Tensor, active: Tensor, going: Tensor, best_actions: Tensor) -> None:
+    """One step of Adam and the clip to [-1, 1]; worlds that do not go on keep their best actions."""
+    keep = going.to(tried.device)[:, None, None]
+    full = torch.zeros_like(tried).index_copy(0, active.to(tried.device), gradient.to(tried))
+    tried.grad = torch.where(keep, full, torch.zeros_like(full))
+    adam.step()
+    with torch.no_grad():
+        tried.clamp_(-1.0, 1.0)
+        tried.copy_(torch.where(keep, tried, best_actions))
+
+
+def _gauge(simulator: Simulator) -> MemoryGauge:
+    simulator.release_memory()
+    return MemoryGauge(simulator.device)
+
+
+def _memory_use(simulator: Simulator, actions: Tensor, gauge: MemoryGauge) -> MemoryUse:
+    worlds, steps = actions.shape[:2]
+    return MemoryUse(worlds, simulator.memory_estimate(steps, worlds=worlds), gauge.peak() if gauge.exact else None)
+
+
+def _evaluate(
+    simulator: Simulator, state: State, actions: Tensor, objective: Objective, gauge: MemoryGauge | None
+) -> tuple[Tensor, Tensor, dict[str, float]]:
+    """Loss (B,) in float64 on the CPU, gradient (B, T, A) and wall times of one evaluation; a gauge leaves out the objective."""
     marks = [time.perf_counter()]
     trajectory = simulator.rollout(state, actions)
     finite = torch.isfinite(trajectory.positions).flatten(1).all(dim=1)
     marks.append(time.perf_counter())
-    if not bool(finite.all()):
-        # An objective cannot be asked about nan: worlds that broke are held at their start and reported as nan.
-        held = state.position.unsqueeze(1).expand_as(trajectory.positions)
-        positions = torch.where(finite[:, None, None, None], trajectory.positions, held)
-        poses = trajectory.manipulator_poses.nan_to_num()
-        result = objective.evaluate(dataclasses.replace(trajectory, positions=positions, manipulator_poses=poses))
-    else:
-        result = objective.evaluate(trajectory)
+    with contextlib.nullcontext() if gauge is None else gauge.leave_out():
+        result = objective.evaluate(trajectory if bool(finite.all()) else _held(trajectory, state, finite))
     marks.append(time.perf_counter())
     gradient = simulator.vjp(trajectory, result.grad_positions, result.grad_manipulators).actions
     marks.append(time.perf_counter())
     loss = torch.where(finite, result.loss.detach().double(), torch.nan).cpu()
     names = ("rollout", "objective", "vjp")
     return loss, gradient, {name: marks[i + 1] - marks[i] for i, name in enumerate(names)}
+
+
+def _held(trajectory: Trajectory, state: State, finite: Tensor) -> Trajectory:
+    """The trajectory with worlds that broke held at their start: an objective cannot be asked about nan."""
+    held = state.position.unsqueeze(1).expand_as(trajectory.positions)
+    positions = torch.where(finite[:, None, None, None], trajectory.positions, held)
+    return dataclasses.replace(trajectory, positions=positions, manipulator_poses=trajectory.manipulator_poses.nan_to_num())

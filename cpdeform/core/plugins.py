@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import importlib.metadata
@@ -25,6 +26,9 @@ KINDS: Mapping[str, str] = {
     "task": "cpdeform_tasks",
 }
 """What can be registered, and the hook that registers it."""
+
+AUTO = "auto"
+"""The name that stands for the fastest simulator or transport solver that is installed; see `PluginSpec.automatic`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,6 +130,40 @@ class Registry:
         if not hasattr(module, attribute):
             raise PluginError(f'{kind} "{name}": module {module_name} has no attribute "{attribute}".')
         return getattr(module, attribute)
+
+    def resolve(self, kind: str, name: str, *, device: str) -> str:
+        """The name that ``"auto"`` stands for on a device; any other name as it is.
+
+        Args:
+            kind: ``"simulator"`` or ``"ot_solver"``.
+            name: What the user typed.
+            device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+
+        Raises:
+            UnknownNameError: No plugin registers the name.
+            PluginError: ``"auto"`` has nothing to choose from: no ranked part for the device can be imported.
+        """
+        if name != AUTO:
+            return self.find(kind, name).spec.name
+        device_type = device.partition(":")[0]
+        ranked = [item.spec for item in self.registrations(kind) if device_type in item.spec.automatic]
+        ranked.sort(key=lambda spec: -spec.automatic[device_type])
+        for spec in ranked:
+            with contextlib.suppress(MissingExtraError, PluginError):
+                self.load(kind, spec.name)
+                return spec.name
+        installs = " or ".join(f'pip install "{spec.extra}"' for spec in ranked if spec.extra)
+        remedy = f"Try {installs}." if installs else "Run `cpdeform plugins` to see what is installed."
+        raise PluginError(f'{kind} "{AUTO}": nothing that is installed runs on {device_type}. {remedy}')
+
+    def option_names(self, kind: str, name: str) -> list[str] | None:
+        """Load a part and return the names of its keyword options; None where it takes any.
+
+        Raises:
+            UnknownNameError: No plugin registers the name.
+            MissingExtraError: An optional dependency is not installed; the message holds the command that installs it.
+        """
+        return _option_names(self.load(kind, name))
 
     def create(self, kind: str, name: str, /, **options: Any) -> Any:
         """Load a part and call it with options.

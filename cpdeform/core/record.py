@@ -2,7 +2,9 @@
 
 ``run.json``
     Configuration, task, status, versions, machine; losses and metric once the run is over. A number that is not finite is
-    null. ``status`` is ``"running"`` until the run is over: a killed run keeps it.
+    null. ``status`` is ``"running"`` until the run is over: a killed run keeps it. ``memory``: estimate and measured peak of
+    the rollouts and gradients of the largest batch, bytes. ``resumed_from``: the record that the run went on from, or null; its
+    stages go on counting, so that the first file is that of the stage after the other record's last one.
 ``metrics.jsonl``
     A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage.
 ``target.h5``, ``stage-000.h5``, ...
@@ -24,6 +26,7 @@ from torch import Tensor
 
 from cpdeform.core.configuration import RunConfiguration
 from cpdeform.core.errors import RecordError
+from cpdeform.core.memory import MemoryUse
 from cpdeform.core.optimizer import Iteration
 from cpdeform.core.record_files import (
     METRICS_FILE,
@@ -59,14 +62,23 @@ class RunRecorder(Observer):
         directory: Where to write; made if missing.
         configuration: What defines the run, kept in the record.
         overwrite: Allow a directory that is not empty; files of an earlier record are then removed, others are left alone.
+        resumed_from: The record that the run goes on from, to be named in this one.
 
     Raises:
         InputError: The directory is not empty (without `overwrite`) or cannot be written.
     """
 
-    def __init__(self, directory: Path | str, *, configuration: RunConfiguration | None = None, overwrite: bool = False) -> None:
+    def __init__(
+        self,
+        directory: Path | str,
+        *,
+        configuration: RunConfiguration | None = None,
+        overwrite: bool = False,
+        resumed_from: RunRecord | None = None,
+    ) -> None:
         self.directory = Path(directory)
         self._configuration = configuration
+        self._resumed_from = resumed_from
         self._overwrite = overwrite
         self._run: dict[str, Any] = {}
         self._batch: dict[int, int] = {}
@@ -91,6 +103,8 @@ class RunRecorder(Observer):
                 "names": dict(names),
                 "seed": seed,
                 "stages_finished": 0,
+                "resumed_from": _origin(self._resumed_from),
+                "memory": None,
                 "recorded_at": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
                 **environment(),
                 "configuration": self._configuration.model_dump(mode="json") if self._configuration else None,
@@ -101,8 +115,21 @@ class RunRecorder(Observer):
             (self.directory / METRICS_FILE).write_text("", encoding="utf-8")
             self._write_run()
 
+    def optimization_started(self, stage: int, worlds: int, memory_estimate: int) -> None:
+        """Note the memory that the rollouts are going to need, for a run that is killed for want of it."""
+        self._note_memory(MemoryUse(worlds, memory_estimate, None))
+        with self._writing():
+            self._write_run()
+
+    def _note_memory(self, use: MemoryUse) -> None:
+        noted = self._run["memory"]
+        if noted is None or use.estimate >= noted["estimate_bytes"]:
+            self._run["memory"] = {"worlds": use.worlds, "estimate_bytes": use.estimate, "peak_bytes": use.peak}
+
     def iteration_finished(self, stage: int, iteration: Iteration) -> None:
         """Append an iteration to the metrics."""
+        if iteration.memory is not None:
+            self._note_memory(iteration.memory)
         # The optimiser counts anew for each batch of candidates; the number of the batch keeps lines apart.
         self._batch[stage] = self._batch.get(stage, -1) + (1 if iteration.index == 0 else 0)
         self._append(
@@ -185,6 +212,14 @@ class RunRecorder(Observer):
             yield
         except OSError as error:
             raise RecordError(f"cannot write the run record in {self.directory}: {error.strerror or error}.") from error
+
+
+def _origin(record: RunRecord | None) -> dict[str, Any] | None:
+    """What a record says about the one that its run goes on from."""
+    if record is None:
+        return None
+    names = record.run.get("names", {})
+    return {"directory": str(record.directory), "status": record.status, "stages": record.next_stage, "names": names}
 
 
 def save_result(

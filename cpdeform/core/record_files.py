@@ -27,7 +27,7 @@ STAGE_PATTERN = re.compile(r"stage-(\d{3,})\.h5")
 OWN_FILES = (RUN_FILE, METRICS_FILE, TARGET_FILE, "picture.png", "animation.mp4", "animation.gif")
 """Files, besides the stages', that `overwrite` may remove; pictures are among them since they would show the old run."""
 
-PACKAGES = ("cpdeform", "torch", "warp-lang", "pot", "geomloss", "numpy", "h5py")
+PACKAGES = ("cpdeform", "torch", "warp-lang", "taichi", "pot", "geomloss", "numpy", "h5py")
 
 
 def stage_file(index: int) -> str:

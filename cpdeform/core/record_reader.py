@@ -49,8 +49,15 @@ class RunRecord:
         return sum(stage.status is Status.FINISHED for stage in self.stages)
 
     @property
+    def next_stage(self) -> int:
+        """Number of the stage that a run going on from here begins with."""
+        return self.stages[-1].index + 1 if self.stages else 0
+
+    @property
     def state(self) -> State:
-        """State after the last complete stage, a single world on the CPU, to go on from: ``deform(..., state=record.state)``.
+        """State after the last complete stage, a single world on the CPU.
+
+        To go on from it: ``deform(..., state=record.state, first_stage=record.next_stage)``, or ``cpdeform run --resume``.
 
         Raises:
             InputError: No stage is complete.

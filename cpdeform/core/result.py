@@ -8,6 +8,7 @@ from pathlib import Path
 
 from torch import Tensor
 
+from cpdeform.core.memory import MemoryUse
 from cpdeform.core.optimizer import Iteration
 from cpdeform.core.placer import PlacementResult
 from cpdeform.core.state import State
@@ -50,7 +51,7 @@ class StageResult:
     """One stage of Algorithm 1.
 
     Attributes:
-        index: Number of the stage, from 0.
+        index: Number of the stage, from 0; a resumed run goes on counting.
         status: How it ended; the state is unchanged unless it is `Status.FINISHED`.
         state_before: State S_i, a single world, tools as the stage found them.
         state: State S_{i+1} after the executed plan.
@@ -121,6 +122,12 @@ class DeformResult:
         """State after the last stage, a single world."""
         return self.stages[-1].state
 
+    @property
+    def memory(self) -> MemoryUse | None:
+        """Memory of the rollouts and gradients of the largest batch; None where no iteration measured it."""
+        uses = [iteration.memory for stage in self.stages for iteration in stage.history if iteration.memory is not None]
+        return max(uses, key=lambda use: use.estimate, default=None)
+
     def save(self, directory: str | Path) -> Path:
         """Write the run record (configuration, metrics, states, actions) to a new directory and return its path.
 
@@ -139,6 +146,9 @@ class Observer:
 
     def run_started(self, task: Task, target: Tensor, names: dict[str, str], seed: int) -> None:
         """The parts are ready and checked."""
+
+    def optimization_started(self, stage: int, worlds: int, memory_estimate: int) -> None:
+        """A batch of candidates is about to be optimised; the estimate is that of a rollout and its gradient, bytes."""
 
     def iteration_finished(self, stage: int, iteration: Iteration) -> None:
         """One gradient evaluation of all candidates of a stage is done."""

@@ -175,8 +175,23 @@ class Simulator(abc.ABC):
         """
 
     @abc.abstractmethod
-    def memory_estimate(self, step_count: int) -> int:
-        """Bytes that a rollout of `step_count` steps in `batch_size` worlds and its `vjp` hold at their peak."""
+    def memory_estimate(self, step_count: int, *, worlds: int | None = None) -> int:
+        """Bytes that a rollout and its `vjp` hold at their peak, above what was there before the rollout.
+
+        It covers all that the two calls make: trajectory with checkpoints, gradients, work space; and the caller's gradient of
+        the positions (B, T+1, N, 3). It does not cover the state and the actions given, the simulator's own constants and
+        compiled kernels, or an objective. `cpdeform bench simulators` measures the same and shows both.
+
+        Args:
+            step_count: Environment steps T.
+            worlds: Number of worlds B; this simulator's `batch_size` where absent.
+
+        Returns:
+            Bytes; within a fifth of what is measured while the bodies stay about as large as they are at the start.
+        """
+
+    def release_memory(self) -> None:  # noqa: B027 - most backends keep nothing
+        """Give back to the system what is kept between rollouts to be used again; trajectories stay usable."""
 
 
 class _RolloutFunction(torch.autograd.Function):

@@ -7,7 +7,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, BinaryIO, Literal, TypeVar, get_args
 
 import numpy as np
 import yaml
@@ -55,7 +55,7 @@ class Task(FrozenModel):
 
 
 def load_target(path: Path, *, scene: Scene) -> NDArray[np.float64]:
-    """Read target particles from ``.npz`` with an array ``position`` (M, 3), or from ``.npy`` with such an array.
+    """Read target particles from ``.npz`` or ``.h5`` with an array ``position`` (M, 3), or from ``.npy`` with such an array.
 
     Integer arrays are positions in units of 2^-16 (compact files), others are in length units.
 
@@ -73,8 +73,11 @@ def load_target(path: Path, *, scene: Scene) -> NDArray[np.float64]:
     try:
         # Opened here, since numpy leaves the file open where it turns out to be a damaged archive.
         with path.open("rb") as file:
-            loaded = np.load(file, allow_pickle=False)
-            values = np.asarray(loaded["position"] if isinstance(loaded, np.lib.npyio.NpzFile) else loaded)
+            if path.suffix == ".h5":
+                values = _read_hdf5(file)
+            else:
+                loaded = np.load(file, allow_pickle=False)
+                values = np.asarray(loaded["position"] if isinstance(loaded, np.lib.npyio.NpzFile) else loaded)
     except FileNotFoundError as error:
         raise InputError(argument, came="no such file", expected="an .npz or .npy file of target particles") from error
     except KeyError as error:
@@ -98,6 +101,14 @@ def load_target(path: Path, *, scene: Scene) -> NDArray[np.float64]:
             remedy="Scale or shift the target.",
         )
     return positions
+
+
+def _read_hdf5(file: BinaryIO) -> NDArray[Any]:
+    """The array ``position`` of an HDF5 file, such as the goal of a run record."""
+    import h5py
+
+    with h5py.File(file, "r") as content:
+        return np.asarray(content["position"])
 
 
 def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -232,6 +243,17 @@ def read_task(path: Path, *, variant: str | None = None) -> Task:
     if isinstance(content.get("target"), str):
         content["target"] = path.parent / content["target"]
     return validate(Task, content, source=f"task file {path}")
+
+
+def changed_task(task: Task, *, scene: Mapping[str, Any]) -> Task:
+    """The task with changes of its scene, nested as `merge` takes them.
+
+    Raises:
+        InputError: A change does not fit.
+    """
+    if not scene:
+        return task
+    return validate(Task, merge(task.model_dump(), {"scene": scene}), source=f"task {task.name} with --set")
 
 
 def list_variants(path: Path) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 import statistics
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +15,7 @@ from cpdeform.core.deform import deform_configuration
 from cpdeform.core.plugins import Registry, load_registry
 from cpdeform.core.result import DeformResult
 from cpdeform.core.task import validate
+from cpdeform.experiments.tables import markdown
 
 COLUMNS = ("task", "placer", "seed", "status", "loss initial", "loss final", "ratio", "metric", "evaluations", "seconds")
 
@@ -33,13 +33,6 @@ def table_row(placer: str, seed: int, result: DeformResult) -> list[str]:
     losses = [f"{result.loss_initial:.6f}", f"{result.loss_final:.6f}", f"{ratio:.3f}", f"{result.metric_value:.3f}"]
     effort = [str(result.gradient_evaluations), f"{result.seconds:.0f}"]
     return [result.task.name, placer, str(seed), result.status.value, *losses, *effort]
-
-
-def markdown(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A Markdown table."""
-    header = list(header)
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def main(

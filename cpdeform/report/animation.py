@@ -79,7 +79,9 @@ def _draw_frames(record: RunRecord, view: View, frames: list[tuple[int, int]]) -
         particles = stage.positions[step].double().numpy()
         tools = tool_surfaces(record, stage.manipulator_poses[step].double().numpy())
         draw_scene(axis, view, particles, clay_colours(view, particles), tools, width=560, quality=1)
-        text = f"{record.task.name}   stage {stage.index + 1}/{len(record.stages)}   step {step}/{len(stage.positions) - 1}"
+        text = (
+            f"{record.task.name}   stage {stage.index + 1}/{record.stages[-1].index + 1}   step {step}/{len(stage.positions) - 1}"
+        )
         figure.text(0.5, 0.96, text, ha="center", va="center", fontsize=12)
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -39,7 +39,7 @@ def goal(state, shift):
 
 
 def test_reaches_the_optimum(simulator, state):
-    optimizer = TrajectoryOptimizer(iterations=200, learning_rate=0.02, patience=200)
+    optimizer = TrajectoryOptimizer(iterations=200, learning_rate=0.02, patience=200, schedule="paper")
     seen = []
     objective = Distance(goal(state, [0.03, -0.02, 0.01]))
     result = optimizer.minimize(simulator, state, zeros(), objective, on_iteration=seen.append)
@@ -74,7 +74,8 @@ def test_a_world_that_breaks_keeps_its_best_and_the_others_go_on(toy_task_file):
     state = simulator.initial_state()
     actions = zeros(2)
     actions[1] = -1.0
-    result = TrajectoryOptimizer(iterations=8).minimize(simulator, state, actions, Distance(goal(state, [0.4, 0.0, 0.0])))
+    optimizer = TrajectoryOptimizer(iterations=8, schedule="paper")
+    result = optimizer.minimize(simulator, state, actions, Distance(goal(state, [0.4, 0.0, 0.0])))
     assert result.finite.tolist() == [False, True]
     assert torch.isfinite(result.loss).all()
     assert 0.3 < float(result.actions[0, :, 0].max()) <= 0.55
@@ -105,6 +106,55 @@ def test_worlds_do_not_influence_each_other(simulator, state):
     together = optimizer.minimize(simulator, state, actions, objective)
     alone = optimizer.minimize(simulator, state.select(1), actions[1:2], objective)
     torch.testing.assert_close(together.actions[1:2], alone.actions)
+
+
+class Remembering(Distance):
+    """Records which worlds it was told to keep, and the size of each batch."""
+
+    def __init__(self, goal):
+        super().__init__(goal)
+        self.kept, self.sizes = [], []
+
+    def keep(self, worlds):
+        self.kept.append(list(worlds))
+
+    def loss(self, positions, manipulator_poses):
+        self.sizes.append(len(positions))
+        return super().loss(positions, manipulator_poses)
+
+
+def test_halving_drops_the_worse_half_and_the_winner_is_that_of_the_paper(simulator, state):
+    # the second world starts nearest to the goal, the third farthest from it
+    first = torch.tensor([0.3, 0.8, -0.9])[:, None, None].expand(3, 5, 3).clone()
+    shift = [0.08, 0.08, 0.08]
+    objective = Remembering(goal(state, shift))
+    options = {"iterations": 24, "learning_rate": 0.01, "patience": 24}
+    halved = TrajectoryOptimizer(**options).minimize(simulator, state, first, objective)
+    full = TrajectoryOptimizer(**options, schedule="paper").minimize(simulator, state, first, Distance(goal(state, shift)))
+    # of 3 worlds 2 are left after 1/4 and 1 after 1/2 of the iterations; what is kept is counted within the last batch
+    assert objective.sizes == [3] * 6 + [2] * 6 + [1] * 12
+    assert objective.kept == [[0, 1], [1]]
+    assert halved.gradient_evaluations == sum(objective.sizes)
+    assert full.gradient_evaluations == 72
+    assert int(halved.loss.argmin()) == int(full.loss.argmin()) == 1
+    torch.testing.assert_close(halved.actions[1], full.actions[1], rtol=0, atol=0)
+    assert halved.finite.all()
+    last = halved.history[-1]
+    assert last.loss.isnan().tolist() == [True, False, True]
+    # the worlds that were dropped come back with the best they had
+    for world, iterations in ((0, 12), (2, 6)):
+        seen = torch.stack([iteration.loss[world] for iteration in full.history[:iterations]])
+        assert float(halved.loss[world]) == float(seen.min())
+
+
+def test_a_single_world_is_not_dropped(simulator, state):
+    one = state.select(0)
+    options = {"iterations": 8, "patience": 8}
+    objective = Distance(goal(state, [0.05, 0.0, 0.0]))
+    halved = TrajectoryOptimizer(**options).minimize(simulator, one, zeros(1), objective)
+    full = TrajectoryOptimizer(**options, schedule="paper").minimize(simulator, one, zeros(1), objective)
+    assert torch.equal(halved.actions, full.actions)
+    assert halved.gradient_evaluations == full.gradient_evaluations == 8
 
 
 def test_first_actions():

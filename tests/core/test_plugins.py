@@ -111,6 +111,37 @@ def test_create_checks_options(toy_entry_points):
         registry.create("ot_solver", "toy", blur="wide")
 
 
+def ranked(monkeypatch, *specs):
+    return load_registry([plugin(monkeypatch, "ranked", cpdeform_simulators=lambda: list(specs))])
+
+
+def test_auto_is_the_highest_rank_of_the_device_that_can_be_imported(monkeypatch):
+    registry = ranked(
+        monkeypatch,
+        PluginSpec("never", "json:loads", ""),
+        PluginSpec("slow", "json:loads", "", automatic={"cpu": 1, "cuda": 9}),
+        PluginSpec("fast", "json:loads", "", automatic={"cpu": 5}),
+        PluginSpec("absent", "json:loads_from_nowhere", "", automatic={"cpu": 10}),
+    )
+    assert registry.resolve("simulator", "auto", device="cpu") == "fast"
+    assert registry.resolve("simulator", "auto", device="cuda:1") == "slow"
+    assert registry.resolve("simulator", "never", device="cpu") == "never"
+    with pytest.raises(UnknownNameError, match="fats"):
+        registry.resolve("simulator", "fats", device="cpu")
+
+
+def test_auto_without_anything_tells_what_to_install(monkeypatch):
+    spec = PluginSpec("absent", "no_such_module_at_all:x", "", extra="some[thing]", automatic={"cpu": 1})
+    with pytest.raises(PluginError, match=r'"auto": nothing that is installed runs on cpu\. Try pip install "some\[thing\]"'):
+        ranked(monkeypatch, spec).resolve("simulator", "auto", device="cpu")
+
+
+def test_auto_has_a_choice_among_the_built_in_parts():
+    registry = load_registry()
+    for kind in ("simulator", "ot_solver"):
+        assert registry.resolve(kind, "auto", device="cpu") in registry.names(kind)
+
+
 def test_built_in_plugins_are_registered():
     registry = load_registry()
     assert not registry.failures

@@ -103,6 +103,23 @@ def test_recorded_during_the_run_and_after_it_is_the_same(tmp_path, run):
     assert runs[0] == runs[1]
 
 
+def test_memory_is_recorded(tmp_path, run):
+    class Listener(Observer):
+        told = ()
+
+        def optimization_started(self, stage, worlds, memory_estimate):
+            self.told += ((stage, worlds, memory_estimate),)
+
+    listener = Listener()
+    result = run(observers=[listener, RunRecorder(tmp_path / "run")])
+    estimate = 8 * 3 * 5 * 60 * 3
+    assert listener.told == ((0, 3, estimate), (1, 3, estimate))
+    memory = load_record(tmp_path / "run").run["memory"]
+    assert memory == {"worlds": 3, "estimate_bytes": estimate, "peak_bytes": result.memory.peak}
+    measured = [iteration.memory is not None for iteration in result.stages[0].history]
+    assert measured == [False, True, False]
+
+
 def test_a_run_goes_on_from_its_record(tmp_path, run):
     first = run(stages=1, observers=[RunRecorder(tmp_path / "run", configuration=RunConfiguration(stages=1))])
     record = load_record(tmp_path / "run")

@@ -11,7 +11,8 @@ from typing import Any
 
 import warp as wp
 
-from cpdeform.backends.warp.kernels_types import BOX, CAPSULE, CHOPSTICKS, CYLINDER, ROLLING_PIN, SPHERE, TORUS, build_types
+from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, ROLLING_PIN, SPHERE, TORUS
+from cpdeform.backends.warp.kernels_types import build_types
 
 
 @functools.cache

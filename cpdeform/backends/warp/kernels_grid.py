@@ -10,8 +10,9 @@ from typing import Any
 
 import warp as wp
 
+from cpdeform.backends.scene_numbers import CHOPSTICKS
 from cpdeform.backends.warp.kernels_distance import build_distance
-from cpdeform.backends.warp.kernels_types import CHOPSTICKS, KERNEL_OPTIONS, build_types
+from cpdeform.backends.warp.kernels_types import KERNEL_OPTIONS, build_types
 from cpdeform.core.scene import WALL_NODES
 
 

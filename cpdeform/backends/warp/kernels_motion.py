@@ -6,8 +6,9 @@ from typing import Any
 
 import warp as wp
 
+from cpdeform.backends.scene_numbers import CHOPSTICKS, ROLLING_PIN
 from cpdeform.backends.warp.kernels_distance import build_distance
-from cpdeform.backends.warp.kernels_types import CHOPSTICKS, KERNEL_OPTIONS, ROLLING_PIN, build_types
+from cpdeform.backends.warp.kernels_types import KERNEL_OPTIONS, build_types
 
 
 @functools.cache

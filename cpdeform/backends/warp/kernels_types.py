@@ -11,18 +11,6 @@ from typing import Any
 
 import warp as wp
 
-SPHERE, CAPSULE, BOX, CYLINDER, TORUS, ROLLING_PIN, CHOPSTICKS = range(7)
-KIND_NUMBERS = {
-    "Sphere": SPHERE,
-    "Capsule": CAPSULE,
-    "Box": BOX,
-    "Cylinder": CYLINDER,
-    "Torus": TORUS,
-    "RollingPin": ROLLING_PIN,
-    "Chopsticks": CHOPSTICKS,
-}
-"""Numbers of the manipulator kinds inside kernels."""
-
 KERNEL_OPTIONS: dict[str, Any] = {
     "enable_backward": False,
     "module": "unique",

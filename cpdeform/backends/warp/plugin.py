@@ -14,5 +14,6 @@ def cpdeform_simulators() -> list[PluginSpec]:
             target="cpdeform.backends.warp.simulator:SimulatorWarp",
             summary="MLS-MPM on NVIDIA Warp, CPU and CUDA, hand-written adjoints",
             extra="cpdeform[warp]",
+            automatic={"cpu": 5, "cuda": 10},
         )
     ]

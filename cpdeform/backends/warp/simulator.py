@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -14,15 +13,16 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from cpdeform.backends.checkpointing import SimulatorCheckpointing
+from cpdeform.backends.scene_numbers import KIND_NUMBERS
 from cpdeform.backends.warp.kernels_grid import build_grid
 from cpdeform.backends.warp.kernels_motion import build_motion
 from cpdeform.backends.warp.kernels_transfer import build_transfer
-from cpdeform.backends.warp.kernels_types import KIND_NUMBERS, build_types
+from cpdeform.backends.warp.kernels_types import build_types
 from cpdeform.backends.warp.lane import Lane, Particles, Program, Substep
 from cpdeform.backends.warp.scene_arrays import make_constants, make_parameters, make_tools
-from cpdeform.core.errors import InputError
 from cpdeform.core.scene import Scene
-from cpdeform.core.simulator import RolloutGradient, Simulator, SimulatorCapabilities, Trajectory
+from cpdeform.core.simulator import RolloutGradient, SimulatorCapabilities, Trajectory
 from cpdeform.core.state import State
 
 Result = TypeVar("Result")
@@ -46,7 +46,7 @@ class _LaneCheckpoints:
     final: Particles
 
 
-class SimulatorWarp(Simulator):
+class SimulatorWarp(SimulatorCheckpointing):
     """MLS-MPM with von Mises plasticity on NVIDIA Warp, with hand-written adjoints.
 
     Args:
@@ -82,13 +82,7 @@ class SimulatorWarp(Simulator):
         threads: int | None = None,
         memory_budget: int = 1 << 29,
     ) -> None:
-        super().__init__(scene, batch_size=batch_size, device=device, dtype=dtype)
-        if threads is not None and threads < 1:
-            raise InputError("threads", came=str(threads), expected="at least 1")
-        if memory_budget < 0:
-            raise InputError("memory_budget", came=str(memory_budget), expected="a number of bytes, 0 or more")
-        self.threads = threads or _available_cores()
-        self.memory_budget = memory_budget
+        super().__init__(scene, batch_size=batch_size, device=device, dtype=dtype, threads=threads, memory_budget=memory_budget)
         _initialize_warp()
         self._real = wp.float64 if self.dtype is torch.float64 else wp.float32
         self._types = build_types(self._real)
@@ -166,7 +160,7 @@ class SimulatorWarp(Simulator):
         shape = (worlds, steps + 1, state.particle_count, 3)
         positions = torch.empty(shape, dtype=self.dtype, device=self.device)
         final = state.map(torch.empty_like)
-        keep = self._history_bytes(steps) * worlds <= self.memory_budget
+        keep = worlds * self._history_bytes(steps, worlds) <= self.memory_budget
         with self._stream():
             poses = self._move_tools(state, actions)
             lanes = self._over_lanes(
@@ -221,12 +215,7 @@ class SimulatorWarp(Simulator):
 
     def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
-        if not isinstance(trajectory.checkpoints, tuple):
-            raise InputError("trajectory", came="a trajectory without checkpoints", expected="one made by this simulator's rollout")
-        if grad_positions.shape != trajectory.positions.shape:
-            raise InputError(
-                "grad_positions", came=f"shape {tuple(grad_positions.shape)}", expected=f"shape {tuple(trajectory.positions.shape)}"
-            )
+        self._check_gradient(trajectory, grad_positions)
         state, actions = trajectory.initial_state, trajectory.actions
         grad_positions = grad_positions.detach().to(device=self.device, dtype=self.dtype)
         gradient = state.map(torch.zeros_like)
@@ -257,15 +246,20 @@ class SimulatorWarp(Simulator):
         position += grad_positions[kept.worlds, steps]
         after = kept.final.velocity
         for step in reversed(range(steps)):
-            records = kept.substeps[step]
-            if records is None:
-                records, _ = self._run_step(lane, kept.starts[step], kept.poses, step, keep=True)
-            assert records is not None
-            for index in reversed(range(self.scene.substeps)):
-                lane.backward(records[index], after, kept.poses, step * self.scene.substeps + index, particles, view)
-                after = records[index].particles.velocity
+            after = self._vjp_step(lane, kept, step, after, particles, view)
             position += grad_positions[kept.worlds, step]
         return grad_poses.reshape(lane.blocks, worlds, frames, tools, 8).sum(dim=0)
+
+    def _vjp_step(self, lane: Lane, kept: _LaneCheckpoints, step: int, after: Any, gradient: Particles, grad_poses: Any) -> Any:
+        """Adjoint of one step, in place; returns the velocities before it. Records that it computes anew end with it."""
+        records = kept.substeps[step]
+        if records is None:
+            records, _ = self._run_step(lane, kept.starts[step], kept.poses, step, keep=True)
+        assert records is not None
+        for index in reversed(range(self.scene.substeps)):
+            lane.backward(records[index], after, kept.poses, step * self.scene.substeps + index, gradient, grad_poses)
+            after = records[index].particles.velocity
+        return after
 
     def _pull_back_tools(self, trajectory: Trajectory, actions: Tensor, grad_poses: Tensor, gradient: State) -> Tensor:
         """Gradient (B, T, A) of the actions; writes that of the start poses to `gradient`."""
@@ -287,42 +281,29 @@ class SimulatorWarp(Simulator):
         wp.launch(self._program.kernels.move_tools_adjoint, dim=(worlds, tools), inputs=inputs, device=self._program.device)
         return grad_actions
 
-    def _particle_bytes(self) -> int:
-        return (3 + 3 + 9 + 6) * self.dtype.itemsize
+    def _rows(self, worlds: int) -> int:
+        """Grid rows of a world: one for each thread that works on it."""
+        return self.threads if self.device.type == "cpu" and worlds < self.threads else 1
 
-    def _grid_bytes(self) -> int:
-        """Bytes of one substep's grid of one world: the full grid on CUDA, about the bodies' bounding boxes on the CPU."""
-        node = 4 * self.dtype.itemsize
-        if self.device.type != "cpu":
-            return node * self.scene.grid_size**3
-        lower = [min(body.position[axis] - body.half_extents[axis] for body in self.scene.bodies) for axis in range(3)]
-        upper = [max(body.position[axis] + body.half_extents[axis] for body in self.scene.bodies) for axis in range(3)]
-        nodes = 1.0
-        for low, high in zip(lower, upper, strict=True):
-            nodes *= (high - low) * self.scene.grid_size + 4
-        return int(node * nodes)
-
-    def _history_bytes(self, step_count: int) -> int:
+    def _history_bytes(self, step_count: int, worlds: int) -> int:
         """Bytes per world to keep every substep of a rollout."""
-        return step_count * self.scene.substeps * (self.scene.particle_count * self._particle_bytes() + self._grid_bytes())
+        substep = self.scene.particle_count * self._particle_bytes() + self._rows(worlds) * self._grid_bytes()
+        return step_count * self.scene.substeps * substep
 
-    def memory_estimate(self, step_count: int) -> int:
-        """Bytes that a rollout of `step_count` steps in `batch_size` worlds and its `vjp` hold at their peak."""
+    def memory_estimate(self, step_count: int, *, worlds: int | None = None) -> int:
+        """Bytes that a rollout and its `vjp` hold at their peak; see `Simulator.memory_estimate`."""
+        worlds = worlds or self.batch_size
         count = self.scene.particle_count
         particles = count * self._particle_bytes()
         snapshots = (step_count + 1) * count * 3 * self.dtype.itemsize
-        whole = self._history_bytes(step_count)
-        kept = step_count * particles + self._history_bytes(1)
-        history = whole if whole * self.batch_size <= self.memory_budget else kept
-        # state, its gradient, the caller's gradient of the snapshots
-        return self.batch_size * (history + 2 * snapshots + 4 * particles)
-
-
-def _available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        # lanes at work at the same time, each with a velocity grid, a gradient grid and, where it computes a step anew, its records
+        active = worlds if self.device.type != "cpu" else (self.threads if worlds >= self.threads else 1)
+        work = active * (1 + self._rows(worlds)) * self._grid_bytes()
+        history = worlds * self._history_bytes(step_count, worlds)
+        if history > self.memory_budget:
+            history = worlds * step_count * particles + active * self._history_bytes(1, worlds)
+        # snapshots and the caller's gradient of them; final state, its gradient, and what a substep makes
+        return history + work + worlds * (2 * snapshots + 3 * particles)
 
 
 def _initialize_warp() -> None:

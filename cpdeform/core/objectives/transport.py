@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -70,6 +72,10 @@ class ObjectiveTransport(Objective):
         """Forget the solutions kept for warm starts."""
         self._previous = []
         self._calls = 0
+
+    def keep(self, worlds: Sequence[int]) -> None:
+        """Forget the solutions of the worlds that were dropped."""
+        self._previous = [self._previous[world] for world in worlds] if self._previous else []
 
     def evaluate(self, trajectory: Trajectory) -> ObjectiveResult:
         """Loss and gradient of each world of a trajectory.

@@ -112,8 +112,8 @@ class SimulatorExample(Simulator):
         *grads, grad_action = torch.autograd.grad(_tensors(end), inputs, _tensors(grad), materialize_grads=True)
         return State(*grads), grad_action
 
-    def memory_estimate(self, step_count: int) -> int:
-        """Bytes that a rollout of `step_count` steps in `batch_size` worlds and its `vjp` hold at their peak.
+    def memory_estimate(self, step_count: int, *, worlds: int | None = None) -> int:
+        """Bytes that a rollout and its `vjp` hold at their peak; see `Simulator.memory_estimate`.
 
         One environment step's graph, which is nearly all of it, and the checkpoints. Right while the bodies keep about their
         size: a body that scatters touches more nodes.
@@ -124,7 +124,7 @@ class SimulatorExample(Simulator):
         substep += nodes * (NUMBERS_PER_NODE + NUMBERS_PER_CONTACT * len(scene.manipulators))
         # a checkpoint, and snapshots of the positions in the trajectory and in its gradient
         checkpoint = scene.particle_count * (3 + 3 + 9 + 6 + 2 * 3)
-        return self.batch_size * self.dtype.itemsize * (scene.substeps * substep + (step_count + 1) * checkpoint)
+        return (worlds or self.batch_size) * self.dtype.itemsize * (scene.substeps * substep + (step_count + 1) * checkpoint)
 
 
 def _touched_nodes(scene: Scene, body: Body) -> int:

@@ -101,6 +101,31 @@ def test_golden_on_the_command_line(recorded):
     assert "torus-v2-seed0" in finished.stdout
 
 
+def test_golden_page(recorded, tmp_path):
+    arguments = ["check", "golden", str(recorded), "--backend", "warp", "--backend", "example", "--allow-unsupported"]
+    page = tmp_path / "golden.md"
+    finished = CliRunner().invoke(app, [*arguments, "--markdown", str(page), "--json"])
+    content = json.loads(finished.stdout.splitlines()[-1])
+    assert (content["backend"], len(content["files"])) == ("warp,example", 4)
+    text = page.read_text()
+    rows = [line.split(" | ") for line in text.splitlines() if line.startswith(("| torus", "| pinch"))]
+    assert [(row[0], row[1], row[-1]) for row in rows] == [
+        ("| pinch-v1", "example", "unsupported |"),
+        ("| pinch-v1", "warp", "unsupported |"),
+        ("| torus-v2-seed0", "example", "passed |"),
+        ("| torus-v2-seed0", "warp", "passed |"),
+    ]
+    assert rows[0][2:7] == ["-"] * 5
+    assert float(rows[3][2]) < 1e-6
+    command = "cpdeform check golden GOLDEN_DIR --backend warp --backend example --markdown golden.md"
+    for words in (command, "cpdeform 0.", "Spoon", "0.0001"):
+        assert words in text
+    assert str(tmp_path) not in text
+    finished = CliRunner().invoke(app, [*arguments, "--markdown", str(tmp_path / "absent" / "golden.md")])
+    assert finished.exit_code == 2
+    assert "--markdown" in finished.stderr
+
+
 def test_golden_needs_files(tmp_path):
     finished = CliRunner().invoke(app, ["check", "golden", str(tmp_path)])
     assert finished.exit_code == 2

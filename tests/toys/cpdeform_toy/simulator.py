@@ -61,8 +61,8 @@ class SimulatorToy(Simulator):
         actions[..., :3] = later * self.scale(actions)
         return RolloutGradient(actions, trajectory.initial_state.map(torch.zeros_like))
 
-    def memory_estimate(self, step_count: int) -> int:
-        return 8 * self.batch_size * step_count * self.scene.particle_count * 3
+    def memory_estimate(self, step_count: int, *, worlds: int | None = None) -> int:
+        return 8 * (worlds or self.batch_size) * step_count * self.scene.particle_count * 3
 
     def scale(self, actions: Tensor) -> Tensor:
         return torch.tensor(self.scene.manipulators[0].action_scale[:3]).to(actions)

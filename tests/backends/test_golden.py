@@ -1,11 +1,11 @@
-"""The Warp backend against recorded trajectories and gradients of PlasticineLab (float64)."""
+"""The backends against recorded trajectories and gradients of PlasticineLab (float64)."""
 
 from __future__ import annotations
 
 import pytest
+from backend_cases import BACKENDS, backend_class
 from golden import NAMES, golden_path
 
-from cpdeform.backends.warp.simulator import SimulatorWarp
 from cpdeform.core.testing import check_golden_file
 
 FORWARD_ONLY = {"chopsticks-v2", "multistage_airplane-v1", "multistage_star-v1"}
@@ -13,8 +13,9 @@ FORWARD_ONLY = {"chopsticks-v2", "multistage_airplane-v1", "multistage_star-v1"}
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_positions_velocities_and_gradient_are_plasticinelabs(name: str) -> None:
-    errors = check_golden_file(golden_path(name), SimulatorWarp)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_positions_velocities_and_gradient_are_plasticinelabs(backend: str, name: str) -> None:
+    errors = check_golden_file(golden_path(name), backend_class(backend))
     assert errors.status == "passed", str(errors)
     assert (errors.gradient_cosine is None) == (name in FORWARD_ONLY)
     if errors.loss_error is not None:

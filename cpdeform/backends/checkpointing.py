@@ -1,0 +1,72 @@
+"""What backends with hand-written adjoints share: options, checks, and the sizes of what they keep for the way back."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cpdeform.backends.scene_numbers import available_cores
+from cpdeform.core.errors import InputError
+from cpdeform.core.scene import Scene
+from cpdeform.core.simulator import Simulator, Trajectory
+
+
+class SimulatorCheckpointing(Simulator):
+    """A simulator that keeps every substep of a rollout in memory, or one checkpoint per environment step.
+
+    Args:
+        scene: What to simulate.
+        batch_size: The most worlds that one call may hold.
+        device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+        dtype: Floating-point type; the backend's first declared one where absent.
+        threads: Threads on the CPU; those the process may use where absent.
+        memory_budget: Bytes that a rollout may keep for its way back. Where all substeps fit, none is computed twice; otherwise
+            one checkpoint per environment step is kept and the inside recomputed.
+
+    Raises:
+        CapabilityError: The device, type or a manipulator is not supported.
+        InputError: An option is out of range.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        batch_size: int,
+        device: torch.device | str,
+        dtype: torch.dtype | None,
+        threads: int | None,
+        memory_budget: int,
+    ) -> None:
+        super().__init__(scene, batch_size=batch_size, device=device, dtype=dtype)
+        if threads is not None and threads < 1:
+            raise InputError("threads", came=str(threads), expected="at least 1")
+        if memory_budget < 0:
+            raise InputError("memory_budget", came=str(memory_budget), expected="a number of bytes, 0 or more")
+        self.threads = threads or available_cores()
+        self.memory_budget = memory_budget
+
+    def _check_gradient(self, trajectory: Trajectory, grad_positions: Tensor) -> None:
+        """Raise `InputError` unless a trajectory can be gone back and the gradient fits it."""
+        if not isinstance(trajectory.checkpoints, tuple):
+            raise InputError("trajectory", came="a trajectory without checkpoints", expected="one made by this simulator's rollout")
+        if grad_positions.shape != trajectory.positions.shape:
+            raise InputError(
+                "grad_positions", came=f"shape {tuple(grad_positions.shape)}", expected=f"shape {tuple(trajectory.positions.shape)}"
+            )
+
+    def _particle_bytes(self) -> int:
+        return (3 + 3 + 9 + 6) * self.dtype.itemsize
+
+    def _grid_bytes(self) -> int:
+        """Bytes of a grid row of one world: the full grid on CUDA, on the CPU the box that the bodies touch at the start.
+
+        The box has one node more upwards, where clay goes when it is pressed.
+        """
+        node, size = 4 * self.dtype.itemsize, self.scene.grid_size
+        if self.device.type != "cpu":
+            return node * size**3
+        lower = [min(body.position[axis] - body.half_extents[axis] for body in self.scene.bodies) for axis in range(3)]
+        upper = [max(body.position[axis] + body.half_extents[axis] for body in self.scene.bodies) for axis in range(3)]
+        edges = [int(high * size - 0.5) - int(low * size - 0.5) + 3 for low, high in zip(lower, upper, strict=True)]
+        return node * edges[0] * (edges[1] + 1) * edges[2]

@@ -1,0 +1,1 @@
+"""MPM on Taichi, CPU and CUDA: kernels with hand-written adjoints, and the host code around them."""

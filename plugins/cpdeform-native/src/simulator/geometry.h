@@ -1,0 +1,196 @@
+// Signed distances of the tools in their local frames, outward normals, and the derivative of the normals. One point at a time: only
+// nodes near a tool come here.
+#pragma once
+
+#include <cmath>
+
+#include "scene.h"
+#include "simd.h"
+
+namespace CPDEFORM_ISA {
+
+template <class Real>
+struct Vector {
+  Real x = 0, y = 0, z = 0;
+
+  CPDEFORM_INLINE Vector operator+(const Vector& o) const { return {x + o.x, y + o.y, z + o.z}; }
+  CPDEFORM_INLINE Vector operator-(const Vector& o) const { return {x - o.x, y - o.y, z - o.z}; }
+  CPDEFORM_INLINE Vector operator*(Real s) const { return {s * x, s * y, s * z}; }
+  CPDEFORM_INLINE Vector operator-() const { return {-x, -y, -z}; }
+  CPDEFORM_INLINE void operator+=(const Vector& o) { *this = *this + o; }
+  CPDEFORM_INLINE void operator-=(const Vector& o) { *this = *this - o; }
+};
+
+template <class Real>
+CPDEFORM_INLINE Real dot(const Vector<Real>& a, const Vector<Real>& b) {
+  return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+template <class Real>
+struct Matrix3 {
+  Real m[3][3];
+  CPDEFORM_INLINE Vector<Real> operator*(const Vector<Real>& v) const {
+    return {m[0][0] * v.x + m[0][1] * v.y + m[0][2] * v.z, m[1][0] * v.x + m[1][1] * v.y + m[1][2] * v.z,
+            m[2][0] * v.x + m[2][1] * v.y + m[2][2] * v.z};
+  }
+  CPDEFORM_INLINE Vector<Real> transposed(const Vector<Real>& v) const {
+    return {m[0][0] * v.x + m[1][0] * v.y + m[2][0] * v.z, m[0][1] * v.x + m[1][1] * v.y + m[2][1] * v.z,
+            m[0][2] * v.x + m[1][2] * v.y + m[2][2] * v.z};
+  }
+};
+
+template <class Real>
+struct Geometry {
+  using P = Vector<Real>;
+
+  // PlasticineLab's length: finite gradient at zero
+  static constexpr Real length_regularization = Real(1e-8);
+
+  CPDEFORM_INLINE static Real length(const P& v) { return std::sqrt(dot(v, v) + length_regularization); }
+  CPDEFORM_INLINE static Real clamp(Real x, Real low, Real high) { return x < low ? low : (x > high ? high : x); }
+  CPDEFORM_INLINE static Real sign(Real x) { return x < 0 ? Real(-1) : Real(1); }
+
+  // Centre of the part of a tool that is nearest to a local point; zero but for chopsticks, which are the nearer of two capsules.
+  static P part_centre(int kind, const Real* size, Real gap, const P& p) {
+    if (kind != cpdeform::chopsticks) return {};
+    return {Real(0.5) * gap * sign(p.x), Real(-0.5) * size[1], 0};
+  }
+
+  struct Surface {
+    P normal;
+    Real distance;
+  };
+
+  static Surface surface(int kind, const Real* size, const P& p) {
+    switch (kind) {
+      case cpdeform::sphere: {
+        const Real r = length(p);
+        return {p * (1 / r), r - size[0]};
+      }
+      case cpdeform::box: {
+        const Real q[3] = {std::abs(p.x) - size[0], std::abs(p.y) - size[1], std::abs(p.z) - size[2]};
+        int axis = q[1] > q[0] ? 1 : 0;
+        if (q[2] > q[axis]) axis = 2;
+        if (q[axis] > 0) {
+          const P o = p - P{clamp(p.x, -size[0], size[0]), clamp(p.y, -size[1], size[1]), clamp(p.z, -size[2], size[2])};
+          const Real r = std::sqrt(dot(o, o));
+          return {o * (1 / r), r - size[3]};
+        }
+        P normal;
+        (axis == 0 ? normal.x : axis == 1 ? normal.y : normal.z) = sign(axis == 0 ? p.x : axis == 1 ? p.y : p.z);
+        return {normal, q[axis] - size[3]};
+      }
+      case cpdeform::cylinder: {
+        const Real r = std::sqrt(p.x * p.x + p.z * p.z + length_regularization);
+        const P out = {p.x / r, 0, p.z / r}, up = {0, sign(p.y), 0};
+        const Real side = r - size[0], top = std::abs(p.y) - size[1];
+        if (side > 0 && top > 0) {
+          const Real distance = std::sqrt(side * side + top * top);
+          return {out * (side / distance) + up * (top / distance), distance};
+        }
+        return side > top ? Surface{out, side} : Surface{up, top};
+      }
+      case cpdeform::torus: {
+        const Real r = std::sqrt(p.x * p.x + p.z * p.z + length_regularization);
+        const Real scale = (r - size[0]) / r;
+        const P q = {scale * p.x, p.y, scale * p.z};
+        const Real s = length(q);
+        return {q * (1 / s), s - size[1]};
+      }
+      default: {
+        const Real h = Real(0.5) * size[1];
+        const P q = {p.x, p.y - clamp(p.y, -h, h), p.z};
+        const Real r = length(q);
+        return {q * (1 / r), r - size[0]};
+      }
+    }
+  }
+
+  CPDEFORM_INLINE static P across(const P& g, const P& normal) { return g - normal * dot(g, normal); }
+
+  // (d normal / d p)^T g; the derivative is symmetric, the distance's Hessian.
+  static P normal_adjoint(int kind, const Real* size, const P& p, const P& g) {
+    switch (kind) {
+      case cpdeform::sphere: {
+        const Real r = length(p);
+        return across(g, p * (1 / r)) * (1 / r);
+      }
+      case cpdeform::box: {
+        const Real q[3] = {std::abs(p.x) - size[0], std::abs(p.y) - size[1], std::abs(p.z) - size[2]};
+        if (!(q[0] > 0 || q[1] > 0 || q[2] > 0)) return {};
+        const P o = p - P{clamp(p.x, -size[0], size[0]), clamp(p.y, -size[1], size[1]), clamp(p.z, -size[2], size[2])};
+        const Real r = std::sqrt(dot(o, o));
+        P result = across(g, o * (1 / r)) * (1 / r);
+        if (q[0] <= 0) result.x = 0;
+        if (q[1] <= 0) result.y = 0;
+        if (q[2] <= 0) result.z = 0;
+        return result;
+      }
+      case cpdeform::cylinder: {
+        const Real r = std::sqrt(p.x * p.x + p.z * p.z + length_regularization);
+        const P out = {p.x / r, 0, p.z / r};
+        const Real side = r - size[0], top = std::abs(p.y) - size[1];
+        const P around = {-out.z, 0, out.x};
+        const P turn = around * (dot(g, around) / r);
+        if (side > 0 && top > 0) {
+          const Real d = std::sqrt(side * side + top * top);
+          const P normal = out * (side / d) + P{0, sign(p.y) * top / d, 0};
+          const P along = across(P{0, 1, 0}, normal);
+          const Real size_along = std::sqrt(dot(along, along));
+          const P unit = along * (1 / (size_along > Real(1e-6) ? size_along : Real(1e-6)));
+          return turn * (side / d) + unit * (dot(g, unit) / d);
+        }
+        return side > top ? turn : P{};
+      }
+      case cpdeform::torus: {
+        const Real r = std::sqrt(p.x * p.x + p.z * p.z + length_regularization);
+        const P out = {p.x / r, 0, p.z / r};
+        const P q = out * (r - size[0]) + P{0, p.y, 0};
+        const Real s = length(q);
+        const P around = {-out.z, 0, out.x};
+        const Real turning = dot(g, around);
+        return across(g - around * turning, q * (1 / s)) * (1 / s) + around * (turning * (r - size[0]) / (r * s));
+      }
+      default: {
+        const Real h = Real(0.5) * size[1];
+        const P q = {p.x, p.y - clamp(p.y, -h, h), p.z};
+        const Real r = length(q);
+        P result = across(g, q * (1 / r)) * (1 / r);
+        if (std::abs(p.y) < h) result.y = 0;
+        return result;
+      }
+    }
+  }
+
+  // Half extents of a box around a tool in its local frame, and that box's centre.
+  static void extents(int kind, const Real* size, Real gap, Real (&half)[3], Real (&centre)[3]) {
+    centre[0] = centre[1] = centre[2] = 0;
+    switch (kind) {
+      case cpdeform::sphere:
+        half[0] = half[1] = half[2] = size[0];
+        return;
+      case cpdeform::box:
+        for (int a = 0; a < 3; ++a) half[a] = size[a] + size[3];
+        return;
+      case cpdeform::cylinder:
+        half[0] = half[2] = size[0];
+        half[1] = size[1];
+        return;
+      case cpdeform::torus:
+        half[0] = half[2] = size[0] + size[1];
+        half[1] = size[1];
+        return;
+      case cpdeform::chopsticks:
+        half[0] = std::abs(Real(0.5) * gap) + size[0];
+        half[1] = Real(0.5) * size[1] + size[0];
+        half[2] = size[0];
+        centre[1] = Real(-0.5) * size[1];
+        return;
+      default:
+        half[0] = half[2] = size[0];
+        half[1] = Real(0.5) * size[1] + size[0];
+    }
+  }
+};
+
+}  // namespace CPDEFORM_ISA
