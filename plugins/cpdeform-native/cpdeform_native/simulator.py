@@ -11,11 +11,17 @@ from torch import Tensor
 
 from cpdeform.backends.checkpointing import SimulatorCheckpointing
 from cpdeform.backends.scene_numbers import KIND_NUMBERS, available_cores, material_numbers, scene_numbers, tool_numbers
-from cpdeform.core.errors import CapabilityError, InputError
+from cpdeform.core.errors import CapabilityError, InputError, MissingExtraError
 from cpdeform.core.scene import WALL_NODES, Scene
 from cpdeform.core.simulator import RolloutGradient, SimulatorCapabilities, Trajectory
 from cpdeform.core.state import State
-from cpdeform_native import _simulator
+
+try:
+    from cpdeform_native import _simulator
+except ImportError as error:
+    raise MissingExtraError(
+        "simulator", "native", module="cpdeform_native._simulator", install="pip install cpdeform-native"
+    ) from error
 
 
 class SimulatorNative(SimulatorCheckpointing):
@@ -91,9 +97,20 @@ class SimulatorNative(SimulatorCheckpointing):
         checkpoints = self._engine.rollout(
             worlds,
             steps,
-            *_arrays(state.position, state.velocity, state.affine, state.elastic_strain, state.manipulator_pose, actions),
-            *_arrays(positions, poses, velocity, affine, strain),
-            self._keeps_substeps(steps, worlds),
+            *_arrays(
+                state.position,
+                state.velocity,
+                state.affine,
+                state.elastic_strain,
+                state.manipulator_pose,
+                actions,
+                positions,
+                poses,
+                velocity,
+                affine,
+                strain,
+            ),
+            keep=self._keeps_substeps(steps, worlds),
         )
         final = State(positions[:, -1].clone(), velocity, affine, strain, poses[:, -1].clone())
         return Trajectory(
@@ -119,7 +136,8 @@ class SimulatorNative(SimulatorCheckpointing):
             poses = grad_manipulators.detach().to(device=self.device, dtype=self.dtype).contiguous().numpy()
         self._engine.vjp(
             trajectory.checkpoints[0],
-            *_arrays(trajectory.actions, grad_positions),
+            trajectory.actions.numpy(),
+            grad_positions.numpy(),
             poses,
             *_arrays(grad_actions, gradient.position, gradient.velocity, gradient.affine, gradient.elastic_strain, grad_pose),
         )
