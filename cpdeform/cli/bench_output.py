@@ -70,8 +70,8 @@ def told(rows: Iterable[dict[str, Any]], *, count: int) -> Iterator[dict[str, An
 
 def _name(row: Mapping[str, Any]) -> str:
     """What a row is about: its text and whole-number fields."""
-    parts = [str(row["backend"] if "backend" in row else row["solver"])]
-    parts += [f"{name} {row[name]:,}" for name in ("particles", "points", "worlds", "threads") if name in row]
+    parts = [str(row[name]) for name in ("backend", "solver") if name in row]
+    parts += [f"{name} {row[name]:,}" for name in ("particles", "points", "worlds", "threads", "seed") if name in row]
     return ", ".join(parts)
 
 
