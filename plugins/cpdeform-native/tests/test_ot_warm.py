@@ -123,7 +123,7 @@ def test_another_blur_starts_cold_and_other_sizes_are_refused() -> None:
 def test_threads_change_no_digit(dtype: torch.dtype) -> None:
     source = cloud(2100, seed=30).to(dtype)
     target = pressed(source).to(dtype)
-    results = [OTSolverNative(blur=3e-3, threads=threads).solve(source, target) for threads in (1, 2, 5)]
+    results = [OTSolverNative(blur=3e-3, tolerance=1e-2, threads=threads).solve(source, target) for threads in (1, 2, 5)]
     for other in results[1:]:
         assert torch.equal(results[0].value, other.value)
         assert torch.equal(results[0].source_potential, other.source_potential)
