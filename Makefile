@@ -12,7 +12,7 @@ OUT ?= runs/first
 .PHONY: run test quick lint targets clean
 
 run: $(NATIVE)
-	$(BIN)/cpdeform run writer --iterations 30 --out $(OUT) --overwrite
+	$(BIN)/cpdeform run writer --out $(OUT) --overwrite
 
 test: $(NATIVE)
 	$(BIN)/python -m pytest

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Protocol
 
 import warp as wp
 
@@ -70,6 +70,35 @@ class Program:
     device: str
 
 
+class Arrays(Protocol):
+    """Where a lane gets its work space from."""
+
+    def kept(self, shape: tuple[int, ...], dtype: Any, *, zero: bool = False) -> Any:
+        """An array that outlives the substep: part of its record or of its result; filled with zeros if asked for."""
+
+    def scratch(self, name: str, shape: tuple[int, ...], dtype: Any, *, zero: bool = False) -> Any:
+        """An array that is read in the substep alone; the next one may be given the same under the same name."""
+
+
+class FreshArrays:
+    """Makes a new array for every request.
+
+    Args:
+        device: Warp's name of the device.
+    """
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+
+    def kept(self, shape: tuple[int, ...], dtype: Any, *, zero: bool = False) -> Any:
+        """See `Arrays.kept`."""
+        return (wp.zeros if zero else wp.empty)(shape, dtype=dtype, device=self._device)
+
+    def scratch(self, name: str, shape: tuple[int, ...], dtype: Any, *, zero: bool = False) -> Any:
+        """See `Arrays.scratch`."""
+        return self.kept(shape, dtype, zero=zero)
+
+
 class Lane:
     """Runs substeps for W worlds.
 
@@ -79,18 +108,29 @@ class Lane:
         particle_count: Particles N of a world.
         pool: Threads for the blocks of one world; None for a single block.
         blocks: Number of blocks.
+        arrays: Gives work space; new arrays each time where absent.
+        full_grid: Whether the grid is the whole one, whose size is known beforehand, on the CPU too.
     """
 
     def __init__(
-        self, program: Program, *, worlds: int, particle_count: int, pool: ThreadPoolExecutor | None = None, blocks: int = 1
+        self,
+        program: Program,
+        *,
+        worlds: int,
+        particle_count: int,
+        pool: ThreadPoolExecutor | None = None,
+        blocks: int = 1,
+        arrays: Arrays | None = None,
+        full_grid: bool = False,
     ) -> None:
         self.program = program
         self.worlds = worlds
         self.particle_count = particle_count
         self._pool = pool
         self.blocks = blocks if pool is not None else 1
-        self._on_cpu = program.device == "cpu"
-        if self._on_cpu:
+        self._arrays = arrays or FreshArrays(program.device)
+        self._boxed = program.device == "cpu" and not full_grid
+        if self._boxed:
             self._bounds = wp.zeros(2, dtype=wp.vec3i, device="cpu")
             self._bounds_view = self._bounds.numpy()
 
@@ -113,35 +153,34 @@ class Lane:
     def _grid_box(self, position: Any) -> tuple[Any, Any, int]:
         """Origin, size and number of nodes of a grid that holds all stencils."""
         n = self.program.parameters.grid_size
-        if not self._on_cpu:
+        if not self._boxed:
             return wp.vec3i(0, 0, 0), wp.vec3i(n, n, n), n**3
         wp.launch(self.program.kernels.bounds, dim=1, inputs=[position, self.program.parameters, self._bounds], device="cpu")
         low, high = self._bounds_view.tolist()
         size = [last - first + 1 for first, last in zip(low, high, strict=True)]
         return wp.vec3i(*low), wp.vec3i(*size), size[0] * size[1] * size[2]
 
-    def _zeros(self, rows: int, nodes: int) -> Any:
-        return wp.zeros((rows, nodes), dtype=self.program.types.vec4, device=self.program.device)
+    def _new_particles(self) -> Particles:
+        types, shape = self.program.types, (self.worlds, self.particle_count)
+        return Particles(*(self._arrays.kept(shape, dtype) for dtype in (types.vec3, types.vec3, types.mat33, types.vec6)))
 
-    def _empty(self, dtype: Any) -> Any:
-        return wp.empty((self.worlds, self.particle_count), dtype=dtype, device=self.program.device)
-
-    def forward(self, particles: Particles, poses: Any, frame: int) -> tuple[Substep, Particles]:
+    def forward(self, particles: Particles, poses: Any, frame: int, after: Particles | None = None) -> tuple[Substep, Particles]:
         """One substep.
 
         Args:
             particles: Particles before it.
             poses: Tool poses (W, frames, tools).
             frame: Number of the substep; tools move from this frame to the next.
+            after: Where the particles after the substep go; arrays of their own where absent.
 
         Returns:
             The record for the adjoint, and the particles after the substep.
         """
-        program, kernels, types = self.program, self.program.kernels, self.program.types
+        program, kernels, node = self.program, self.program.kernels, self.program.types.vec4
         origin, size, nodes = self._grid_box(particles.position)
-        grid = self._zeros(self.blocks * self.worlds, nodes)
-        velocity = wp.empty((self.worlds, nodes), dtype=types.vec4, device=program.device)
-        after = Particles(self._empty(types.vec3), self._empty(types.vec3), self._empty(types.mat33), self._empty(types.vec6))
+        grid = self._arrays.kept((self.blocks * self.worlds, nodes), node, zero=True)
+        velocity = self._arrays.scratch("velocity", (self.worlds, nodes), node)
+        after = after or self._new_particles()
         tools, box = (poses, program.tools, program.parameters, frame), (origin, size)
         matter = (*particles.arrays, program.constants, program.parameters)
         moved = (after.position, after.velocity, after.affine)
@@ -176,8 +215,9 @@ class Lane:
         program, kernels = self.program, self.program.kernels
         before, grid, box = substep.particles, substep.grid, (substep.origin, substep.size)
         nodes = grid.shape[1]
-        velocity = wp.empty((self.worlds, nodes), dtype=program.types.vec4, device=program.device)
-        grad_grid = self._zeros(self.blocks * self.worlds, nodes)
+        node = program.types.vec4
+        velocity = self._arrays.scratch("velocity", (self.worlds, nodes), node)
+        grad_grid = self._arrays.scratch("gradient", (self.blocks * self.worlds, nodes), node, zero=True)
         tools = (poses, program.tools, program.parameters, frame)
         matter = (*before.arrays, program.constants, program.parameters)
         moved = (gradient.position, gradient.velocity, gradient.affine)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cpdeform.backends.checkpointing import SimulatorCheckpointing
 from cpdeform.backends.scene_numbers import KIND_NUMBERS
+from cpdeform.backends.warp.graph import Capture, Graphs, Lease, RolloutSlot, SlotKey, SlotPool, capture_on_cuda
 from cpdeform.backends.warp.kernels_grid import build_grid
 from cpdeform.backends.warp.kernels_motion import build_motion
 from cpdeform.backends.warp.kernels_transfer import build_transfer
@@ -58,6 +59,8 @@ class SimulatorWarp(SimulatorCheckpointing):
             of one world (whose sums then depend on the number of threads in the last digits).
         memory_budget: Bytes that a rollout may keep for its way back. Where all substeps fit, none is computed twice; otherwise
             one checkpoint per environment step is kept and the inside recomputed.
+        graphs: Whether rollouts on CUDA are captured as CUDA graphs, from the second of a shape (worlds, steps) on, and replayed;
+            otherwise their kernels are launched one by one. Without effect on the CPU.
 
     Raises:
         CapabilityError: The device, type or a manipulator is not supported.
@@ -81,6 +84,7 @@ class SimulatorWarp(SimulatorCheckpointing):
         dtype: torch.dtype | None = None,
         threads: int | None = None,
         memory_budget: int = 1 << 29,
+        graphs: bool = True,
     ) -> None:
         super().__init__(scene, batch_size=batch_size, device=device, dtype=dtype, threads=threads, memory_budget=memory_budget)
         _initialize_warp()
@@ -88,6 +92,9 @@ class SimulatorWarp(SimulatorCheckpointing):
         self._types = build_types(self._real)
         self._program = self._make_program()
         self._pool = ThreadPoolExecutor(self.threads) if self.device.type == "cpu" and self.threads > 1 else None
+        self._done: torch.cuda.Event | None = None
+        captured = graphs and self.device.type == "cuda"
+        self._slots = self._make_slots(capture_on_cuda(self.device)) if captured else None
 
     def _make_program(self) -> Program:
         device = "cpu" if self.device.type == "cpu" else f"cuda:{self.device.index or 0}"
@@ -107,14 +114,36 @@ class SimulatorWarp(SimulatorCheckpointing):
             device=device,
         )
 
+    def _make_slots(self, capture: Capture | None) -> SlotPool[RolloutSlot]:
+        # nothing here refers to the simulator, which would else live until a garbage collection, and so would its slots
+        program, graphs, start = self._program, Graphs(capture), self.initial_state(batch_size=1)
+        action_size = self.scene.action_size
+        return SlotPool(lambda key: RolloutSlot(program, key, start=start, action_size=action_size, graphs=graphs))
+
+    def release_memory(self) -> None:
+        """Drop the arrays and graphs of rollouts whose trajectories are gone; see `Simulator.release_memory`."""
+        if self._slots is None:
+            return
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)  # streams other than the one that made the arrays may still read them
+        self._slots.clear()
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+
     @contextlib.contextmanager
     def _stream(self) -> Iterator[None]:
         """Order Warp's work with torch's on CUDA."""
         if self.device.type == "cpu":
             yield
-        else:
-            with torch.cuda.device(self.device), wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream())):
+            return
+        with torch.cuda.device(self.device):
+            current = torch.cuda.current_stream()
+            # a slot that came back may still be in use on the stream that the caller had chosen before
+            if self._done is not None:
+                current.wait_event(self._done)
+            with wp.ScopedStream(wp.stream_from_torch(current)):
                 yield
+            self._done = current.record_event()
 
     def _lanes(self, worlds: int) -> list[tuple[Lane, slice]]:
         count = self.scene.particle_count
@@ -156,11 +185,33 @@ class SimulatorWarp(SimulatorCheckpointing):
         self.check_inputs(state, actions)
         state = state.to(device=self.device, dtype=self.dtype).map(lambda tensor: tensor.detach().contiguous())
         actions = actions.detach().to(device=self.device, dtype=self.dtype).contiguous()
+        worlds, steps = state.batch_size, actions.shape[1]
+        keep = worlds * self._history_bytes(steps, worlds) <= self.memory_budget
+        if self._slots is None:
+            return self._rollout_lanes(state, actions, keep)
+        slots = self._slots
+
+        def work() -> tuple[Lease[RolloutSlot], tuple[Tensor, Tensor, State]]:
+            lease = slots.take(SlotKey(worlds, steps, keep))
+            return lease, lease.slot.rollout(state, actions)
+
+        with self._stream():
+            lease, (positions, poses, final) = slots.with_memory(work)
+        return Trajectory(
+            positions=positions,
+            manipulator_poses=poses,
+            actions=actions,
+            initial_state=state,
+            final_state=final,
+            checkpoints=(lease,),
+        )
+
+    def _rollout_lanes(self, state: State, actions: Tensor, keep: bool) -> Trajectory:
+        """Launch a rollout kernel by kernel."""
         worlds, steps, tools = state.batch_size, actions.shape[1], state.manipulator_pose.shape[1]
         shape = (worlds, steps + 1, state.particle_count, 3)
         positions = torch.empty(shape, dtype=self.dtype, device=self.device)
         final = state.map(torch.empty_like)
-        keep = worlds * self._history_bytes(steps, worlds) <= self.memory_budget
         with self._stream():
             poses = self._move_tools(state, actions)
             lanes = self._over_lanes(
@@ -216,8 +267,18 @@ class SimulatorWarp(SimulatorCheckpointing):
     def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
         self._check_gradient(trajectory, grad_positions)
-        state, actions = trajectory.initial_state, trajectory.actions
         grad_positions = grad_positions.detach().to(device=self.device, dtype=self.dtype)
+        grad_poses = None if grad_manipulators is None else grad_manipulators.detach()
+        lease = trajectory.checkpoints[0]
+        if self._slots is None or not isinstance(lease, Lease):
+            return self._vjp_lanes(trajectory, grad_positions, grad_poses)
+        slot: RolloutSlot = lease.slot
+        with self._stream():
+            return self._slots.with_memory(lambda: slot.vjp(grad_positions, grad_poses))
+
+    def _vjp_lanes(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None) -> RolloutGradient:
+        """Launch a vjp kernel by kernel."""
+        state, actions = trajectory.initial_state, trajectory.actions
         gradient = state.map(torch.zeros_like)
         lanes = self._lanes(state.batch_size)
         with self._stream():
@@ -303,7 +364,10 @@ class SimulatorWarp(SimulatorCheckpointing):
         if history > self.memory_budget:
             history = worlds * step_count * particles + active * self._history_bytes(1, worlds)
         # snapshots and the caller's gradient of them; final state, its gradient, and what a substep makes
-        return history + work + worlds * (2 * snapshots + 3 * particles)
+        common = 2 * snapshots + 3 * particles
+        if self._slots is not None:  # a slot has the gradient of the snapshots, the end and its gradient for itself once more
+            common += snapshots + 2 * particles
+        return history + work + worlds * common
 
 
 def _initialize_warp() -> None:
