@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cpdeform.backends.scene_numbers import available_cores
 from cpdeform.core.errors import InputError
+from cpdeform.core.machine import available_cores
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import Simulator, Trajectory
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,10 +159,3 @@ def material_numbers(scene: Scene) -> NDArray[np.float64]:
     table = np.array([[item.shear_modulus, item.lame_lambda, item.yield_stress] for item in materials])
     numbers: NDArray[np.float64] = table[body_index(scene)]
     return numbers
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

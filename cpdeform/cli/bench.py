@@ -64,9 +64,9 @@ def bench_simulators_command(
 
     Exit code 0: measured; 1: no combination could run; 2: unusable input.
     """
+    from cpdeform.core.machine import available_cores
     from cpdeform.core.plugins import load_registry
     from cpdeform.experiments.bench_simulators import SimulatorBenchSettings, bench_simulators, default_backends
-    from cpdeform.experiments.tables import available_cores
 
     check_device(device)
     registry = load_registry()

@@ -49,10 +49,10 @@ def bench_run_command(
 
     Exit code 0: measured; 1: no combination could run; 2: unusable input.
     """
+    from cpdeform.core.machine import available_cores
     from cpdeform.core.plugins import load_registry
     from cpdeform.core.task import load_task
     from cpdeform.experiments.bench_run import RunBenchSettings, bench_run
-    from cpdeform.experiments.tables import available_cores
 
     check_device(device)
     registry = load_registry()

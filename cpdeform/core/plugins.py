@@ -97,6 +97,14 @@ class Registry:
         """Names registered for a kind."""
         return [registration.spec.name for registration in self.registrations(kind)]
 
+    def installed(self, kind: str) -> dict[str, Any]:
+        """The parts of a kind that can be imported, by name: those whose optional dependencies are installed."""
+        found = {}
+        for name in self.names(kind):
+            with contextlib.suppress(CpdeformError):
+                found[name] = self.load(kind, name)
+        return found
+
     def find(self, kind: str, name: str) -> Registration:
         """Look a part up by name.
 

@@ -8,10 +8,10 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from cpdeform.core.errors import CpdeformError, InputError
+from cpdeform.core.errors import InputError
 from cpdeform.core.plugins import Registry
 from cpdeform.experiments.ot_measurement import OTMeasurement
-from cpdeform.experiments.worker import WorkerError, call_in_worker
+from cpdeform.experiments.worker import measured
 
 MEASURE = "cpdeform.experiments.ot_measurement:measure"
 
@@ -92,14 +92,7 @@ class OTBenchSettings:
 
 def default_solvers(registry: Registry) -> tuple[str, ...]:
     """All registered transport solvers that are installed with what they need."""
-    names = []
-    for name in registry.names("ot_solver"):
-        try:
-            registry.load("ot_solver", name)
-        except CpdeformError:
-            continue
-        names.append(name)
-    return tuple(names)
+    return tuple(registry.installed("ot_solver"))
 
 
 def bench_ot(settings: OTBenchSettings, *, registry: Registry) -> Iterator[dict[str, Any]]:
@@ -132,9 +125,4 @@ def measure_row(measurement: OTMeasurement, *, timeout: float) -> dict[str, Any]
     """
     row: dict[str, Any] = {name: getattr(measurement, name) for name in ("solver", "device", "blur", "threads", "points")}
     row |= dict.fromkeys(MEASURED)
-    threads = {"OMP_NUM_THREADS": str(measurement.threads), "MKL_NUM_THREADS": str(measurement.threads)}
-    try:
-        found = call_in_worker(MEASURE, dataclasses.asdict(measurement), timeout=timeout, environment=threads)
-    except WorkerError as error:
-        return {**row, "error": str(error)}
-    return {**row, **found, "error": None}
+    return measured(row, MEASURE, dataclasses.asdict(measurement), threads=measurement.threads, timeout=timeout)

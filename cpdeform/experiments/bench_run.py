@@ -11,7 +11,7 @@ from cpdeform.core.configuration import RunConfiguration
 from cpdeform.core.errors import InputError
 from cpdeform.core.memory import MemoryGauge
 from cpdeform.core.plugins import Registry, load_registry
-from cpdeform.experiments.worker import WorkerError, call_in_worker
+from cpdeform.experiments.worker import measured
 
 RUN = "cpdeform.experiments.bench_run:run"
 MEGABYTE = 1e6
@@ -118,12 +118,7 @@ def bench_run(settings: RunBenchSettings, *, registry: Registry) -> Iterator[dic
 def _row(configuration: RunConfiguration, settings: RunBenchSettings) -> dict[str, Any]:
     row: dict[str, Any] = {name: getattr(configuration, name) for name in ("task", "backend", "device", "seed")}
     row |= {"solver": configuration.ot, "threads": settings.threads, **dict.fromkeys(MEASURED)}
-    environment = {"OMP_NUM_THREADS": str(settings.threads), "MKL_NUM_THREADS": str(settings.threads)}
-    try:
-        found = call_in_worker(RUN, configuration.model_dump(mode="json"), timeout=settings.timeout, environment=environment)
-    except WorkerError as error:
-        return {**row, "error": str(error)}
-    return {**row, **found, "error": None}
+    return measured(row, RUN, configuration.model_dump(mode="json"), threads=settings.threads, timeout=settings.timeout)
 
 
 def run(request: dict[str, Any]) -> dict[str, Any]:

@@ -7,10 +7,10 @@ import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from cpdeform.core.errors import CpdeformError, InputError, UnknownNameError
+from cpdeform.core.errors import InputError, UnknownNameError
 from cpdeform.core.plugins import Registry
 from cpdeform.experiments.simulator_measurement import DTYPES, SimulatorMeasurement
-from cpdeform.experiments.worker import WorkerError, call_in_worker
+from cpdeform.experiments.worker import measured
 
 MEASURE = "cpdeform.experiments.simulator_measurement:measure"
 SLOW = ("example",)
@@ -94,17 +94,8 @@ class SimulatorBenchSettings:
 
 def default_backends(registry: Registry) -> tuple[str, ...]:
     """All registered simulators that are installed with what they need and have a gradient, but for the slow oracles."""
-    names = []
-    for name in registry.names("simulator"):
-        if name in SLOW:
-            continue
-        try:
-            simulator = registry.load("simulator", name)
-        except CpdeformError:
-            continue
-        if simulator.capabilities.differentiable:
-            names.append(name)
-    return tuple(names)
+    found = registry.installed("simulator").items()
+    return tuple(name for name, simulator in found if name not in SLOW and simulator.capabilities.differentiable)
 
 
 def bench_simulators(settings: SimulatorBenchSettings, *, registry: Registry) -> Iterator[dict[str, Any]]:
@@ -143,9 +134,4 @@ def measure_row(measurement: SimulatorMeasurement, *, timeout: float) -> dict[st
     row: dict[str, Any] = {name: getattr(measurement, name) for name in ("backend", "device", "dtype", "threads")}
     row |= {"particles": measurement.particles, "worlds": measurement.worlds}
     row |= {name: row.get(name) for name in MEASURED}
-    threads = {"OMP_NUM_THREADS": str(measurement.threads), "MKL_NUM_THREADS": str(measurement.threads)}
-    try:
-        found = call_in_worker(MEASURE, dataclasses.asdict(measurement), timeout=timeout, environment=threads)
-    except WorkerError as error:
-        return {**row, "error": str(error)}
-    return {**row, **found, "error": None}
+    return measured(row, MEASURE, dataclasses.asdict(measurement), threads=measurement.threads, timeout=timeout)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from cpdeform.core.machine import available_cores
 from cpdeform.core.plugins import Registry
 from cpdeform.core.record_files import environment
 
@@ -22,11 +23,6 @@ def markdown(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 def cell(value: Any, pattern: str = "") -> str:
     """A value as text, formatted by a pattern such as ``.3g``; a dash for None."""
     return "-" if value is None else format(value, pattern)
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def describe_machine(*, device: str = "cpu") -> dict[str, Any]:

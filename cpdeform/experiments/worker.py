@@ -60,6 +60,26 @@ def call_in_worker(
     return cast(dict[str, Any], answer["result"])
 
 
+def measured(row: Mapping[str, Any], target: str, request: Mapping[str, Any], *, threads: int, timeout: float) -> dict[str, Any]:
+    """Fill a row of a bench with what a function finds in a process of its own.
+
+    Args:
+        row: What the row says already.
+        target: See `call_in_worker`.
+        request: See `call_in_worker`.
+        threads: Threads of the libraries in that process.
+        timeout: Seconds after which it is given up.
+
+    Returns:
+        The row with the findings, and ``error``: None, or why there are none.
+    """
+    environment = {"OMP_NUM_THREADS": str(threads), "MKL_NUM_THREADS": str(threads)}
+    try:
+        return {**row, **call_in_worker(target, request, timeout=timeout, environment=environment), "error": None}
+    except WorkerError as error:
+        return {**row, "error": str(error)}
+
+
 def _death(finished: subprocess.CompletedProcess[str]) -> str:
     """Why a process ended without an answer."""
     if finished.returncode < 0:

@@ -18,8 +18,8 @@ from typing import Any
 
 import torch
 
-from cpdeform.backends.scene_numbers import available_cores
 from cpdeform.core.errors import CapabilityError, CpdeformError
+from cpdeform.core.machine import available_cores
 
 __all__ = ["TaichiRuntimeError", "require", "ti"]
 

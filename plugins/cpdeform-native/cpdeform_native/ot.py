@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cpdeform.backends.scene_numbers import available_cores
 from cpdeform.core.errors import InputError, MissingExtraError
+from cpdeform.core.machine import available_cores
 from cpdeform.core.ot import OTCapabilities, OTResult, OTSolver, fix_gauge
 from cpdeform.ot.divergence import Potentials, Problem, check_options, usable_state
 

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from cpdeform.backends.checkpointing import SimulatorCheckpointing
-from cpdeform.backends.scene_numbers import KIND_NUMBERS, available_cores, material_numbers, scene_numbers, tool_numbers
+from cpdeform.backends.scene_numbers import KIND_NUMBERS, material_numbers, scene_numbers, tool_numbers
 from cpdeform.core.errors import CapabilityError, InputError, MissingExtraError
+from cpdeform.core.machine import available_cores
 from cpdeform.core.scene import WALL_NODES, Scene
 from cpdeform.core.simulator import RolloutGradient, SimulatorCapabilities, Trajectory
 from cpdeform.core.state import State
