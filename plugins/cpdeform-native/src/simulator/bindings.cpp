@@ -104,7 +104,7 @@ class Simulator {
     made->shared = shared_;
     made->worlds = worlds;
     made->steps = steps;
-    made->history.reset(shared_->engine->make_history(worlds, steps, keep));
+    made->history.reset(shared_->engine->make_history(worlds, steps));
     shared_->team.run([&](int thread) { shared_->engine->rollout(shared_->team, thread, arguments, *made->history); });
     return made;
   }

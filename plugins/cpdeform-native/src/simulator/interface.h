@@ -54,7 +54,7 @@ class Engine {
   virtual ~Engine() = default;
   // Give back what is kept between calls. One thread, while no other method runs.
   virtual void release_memory() = 0;
-  virtual History* make_history(int64_t worlds, int64_t steps, bool keep) = 0;
+  virtual History* make_history(int64_t worlds, int64_t steps) = 0;
   virtual void rollout(Team& team, int thread, const RolloutArguments<Real>& arguments, History& history) = 0;
   virtual void vjp(Team& team, int thread, const VjpArguments<Real>& arguments, History& history) = 0;
 };

@@ -10,10 +10,7 @@ class EngineOf final : public cpdeform::Engine<Real> {
 
   class HistoryOf final : public cpdeform::History {
    public:
-    HistoryOf(int64_t worlds, int64_t steps, bool keep) : count(worlds), keep(keep) {
-      this->worlds = new WorldHistory<Real>[worlds];
-      (void)steps;
-    }
+    explicit HistoryOf(int64_t count) : count(count), worlds(new WorldHistory<Real>[count]) {}
     ~HistoryOf() override { delete[] worlds; }
     int64_t bytes() const override {
       int64_t total = 0;
@@ -21,7 +18,6 @@ class EngineOf final : public cpdeform::Engine<Real> {
       return total;
     }
     int64_t count;
-    bool keep;
     WorldHistory<Real>* worlds;
   };
 
@@ -41,8 +37,8 @@ class EngineOf final : public cpdeform::Engine<Real> {
     pool_.clear();
   }
 
-  cpdeform::History* make_history(int64_t worlds, int64_t steps, bool keep) override {
-    HistoryOf* history = new HistoryOf(worlds, steps, keep);
+  cpdeform::History* make_history(int64_t worlds, int64_t steps) override {
+    HistoryOf* history = new HistoryOf(worlds);
     const cpdeform::Scene& scene = world_.scene();
     for (int64_t w = 0; w < worlds; ++w) {
       WorldHistory<Real>& h = history->worlds[w];
