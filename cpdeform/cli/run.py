@@ -27,6 +27,8 @@ FLAGS = {
     "device": "--device",
     "seed": "--seed",
     "stages": "--stages",
+    "steps": "--steps",
+    "target": "--target",
     "optimizer.iterations": "--iterations",
 }
 """Flag of each field of the configuration that has one, for messages."""
@@ -44,6 +46,10 @@ def run(
     device: Annotated[str | None, typer.Option(help="cpu or cuda.  [default: cpu]", metavar="NAME")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of first actions and random placements.  [default: 0]")] = None,
     stages: Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")] = None,
+    steps: Annotated[int | None, typer.Option(help="Environment steps of a stage.  [default: the task's]")] = None,
+    target: Annotated[
+        Path | None, typer.Option(help="Goal file instead of the task's own, see `cpdeform task import-grid`.", metavar="FILE")
+    ] = None,
     iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: 40]")] = None,
     settings: Annotated[
         list[str] | None,
@@ -66,9 +72,10 @@ def run(
 
     Exit code 0: a plan was found; 1: none was (the advice says what to try); 2: unusable input; 130: interrupted.
     """
-    flags = (task, backend, ot, placer, device, seed, stages, iterations)
+    flags = (task, backend, ot, placer, device, seed, stages, steps, target, iterations)
     given = {field: value for field, value in zip(FLAGS, flags, strict=True) if value is not None}
-    from cpdeform.core.deform import check_names, resolved
+    from cpdeform.core.configuration import with_task_settings
+    from cpdeform.core.deform import check_names, configured_task, resolved
     from cpdeform.core.plugins import load_registry
 
     configuration, resumption = _configure(given, settings or []), None
@@ -76,6 +83,8 @@ def run(
     if resume is not None:
         configuration, resumption = _resume(resume, given, settings or [], registry, out=out)
     check_names(configuration, registry=registry)
+    if resumption is None:
+        configuration = with_task_settings(configuration, configured_task(configuration, registry=registry))
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         configuration = resolved(configuration, registry=registry)
         # Libraries print to stdout, too; a reader of the JSON must not see that.

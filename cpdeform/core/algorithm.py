@@ -161,7 +161,7 @@ class Planner:
         if self.placer.capabilities.needs_priorities:
             priorities = self.ot_solver.solve(state.position[0], target).source_potential
         clock.lap("transport")
-        stage = Stage(index, self.task.scene, state, target, priorities, generator)
+        stage = Stage(index, self.task.scene, state, target, priorities, generator, loss_before)
         candidates: list[PlacementResult] = []
         history: list[Iteration] = []
         evaluations = 0

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.objectives.contact import ContactKind
 from cpdeform.core.plugins import AUTO
 from cpdeform.core.scene import FrozenModel
+from cpdeform.core.task import Task, merge, validate
+
+PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType({"optimizer": {"schedule": "paper"}})
+"""What ``algorithm=paper`` sets where the user does not: Algorithm 1 to the letter."""
+
+PAPER_PLACER_OPTIONS: Mapping[str, Any] = MappingProxyType(
+    {"distance_scale": 1.0, "max_gap": None, "poses": ("left-right", "top-bottom", "front-back"), "attempts": 1}
+)
+"""Options of the placer ``transport`` with ``algorithm=paper``."""
 
 
 class OptimizerConfiguration(FrozenModel):
@@ -38,16 +51,22 @@ class ObjectiveConfiguration(FrozenModel):
     """What a plan's loss is.
 
     Attributes:
+        kind: ``"transport"``: transport cost between the last step's particles and the goal (the paper); ``"plasticinelab"``:
+            density, distance and contact terms of node masses, summed over all steps.
         points: Particles that the transport loss is computed on, a fixed random subset; None for all.
         blur: Entropic blur of the transport loss, length units.
         refresh: Solve from scratch every so many evaluations, warm-started between.
-        contact_weight: Weight of PlasticineLab's contact term, which draws tools to the body.
+        contact_weight: Weight of PlasticineLab's contact term, which draws tools to the body; where absent 0 for ``"transport"``
+            and 1 for ``"plasticinelab"``.
+        contact: Kind of the contact term of ``"plasticinelab"``; see `cpdeform.core.objectives.contact.contact_loss`.
     """
 
+    kind: Literal["transport", "plasticinelab"] = "transport"
     points: int | None = Field(default=2000, ge=1)
     blur: float = Field(default=2e-3, gt=0.0)
     refresh: int = Field(default=20, ge=1)
-    contact_weight: float = Field(default=0.0, ge=0.0)
+    contact_weight: float | None = Field(default=None, ge=0.0)
+    contact: ContactKind = "plasticinelab"
 
 
 class RunConfiguration(FrozenModel):
@@ -61,6 +80,9 @@ class RunConfiguration(FrozenModel):
         device: Where tensors live, ``"cpu"`` or ``"cuda"``.
         seed: Seed of first actions and random placements.
         stages: Number of stages; the task's own where absent.
+        steps: Environment steps of a stage; the task's own where absent.
+        target: File of the goal instead of the task's own, e.g. one written by `cpdeform task import-grid`.
+        algorithm: ``"cpdeform"``, or ``"paper"`` for Algorithm 1 to the letter (`PAPER_SETTINGS`, `PAPER_PLACER_OPTIONS`).
         optimizer: Options of the optimiser.
         objective: Options of the loss.
         priorities: Options of the transport priorities.
@@ -77,6 +99,9 @@ class RunConfiguration(FrozenModel):
     device: str = "cpu"
     seed: int = Field(default=0, ge=0)
     stages: int | None = Field(default=None, ge=1)
+    steps: int | None = Field(default=None, ge=1)
+    target: Path | None = None
+    algorithm: Literal["cpdeform", "paper"] = "cpdeform"
     optimizer: OptimizerConfiguration = OptimizerConfiguration()
     objective: ObjectiveConfiguration = ObjectiveConfiguration()
     priorities: PrioritiesConfiguration = PrioritiesConfiguration()
@@ -91,3 +116,25 @@ class RunConfiguration(FrozenModel):
         if not re.fullmatch(r"cpu|cuda(:\d+)?", value):
             raise InputError("device", came=f'"{value}"', expected='"cpu", "cuda" or "cuda:N"')
         return value
+
+
+def with_task_settings(configuration: RunConfiguration, task: Task) -> RunConfiguration:
+    """Fill in, where the user set nothing, what the algorithm prescribes and then what the task's `settings` say.
+
+    Args:
+        configuration: What the user set; fields that were not set do not count.
+        task: The task to be run.
+
+    Raises:
+        InputError: The task's settings do not fit.
+    """
+    given = configuration.model_dump(exclude_unset=True)
+    base = dict(task.settings)
+    placer = given.get("placer", base.get("placer", configuration.placer))
+    if placer != base.get("placer", "transport"):
+        base.pop("placer_options", None)
+    if configuration.algorithm == "paper":
+        base = merge(base, PAPER_SETTINGS)
+        if placer == "transport":
+            base = merge(base, {"placer_options": PAPER_PLACER_OPTIONS})
+    return validate(RunConfiguration, merge(base, given), source=f"task {task.name}: settings")

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 
 from cpdeform.core.algorithm import Planner
-from cpdeform.core.configuration import ObjectiveConfiguration, RunConfiguration
+from cpdeform.core.configuration import ObjectiveConfiguration, RunConfiguration, with_task_settings
 from cpdeform.core.errors import InputError
 from cpdeform.core.hook_observer import HookObserver
 from cpdeform.core.objective import Objective
+from cpdeform.core.objectives.plasticinelab import ObjectivePlasticineLab, mass_grid
 from cpdeform.core.objectives.transport import ObjectiveTransport
 from cpdeform.core.optimizer import TrajectoryOptimizer
 from cpdeform.core.ot import OTSolver
@@ -32,7 +33,7 @@ def deform(
     *,
     simulator: Simulator | str = AUTO,
     ot_solver: OTSolver | str = AUTO,
-    placer: Placer | str = "transport",
+    placer: Placer | str | None = None,
     objective: Objective | None = None,
     optimizer: TrajectoryOptimizer | None = None,
     device: str = "cpu",
@@ -50,9 +51,10 @@ def deform(
         simulator: A simulator of the task's scene, or a registered name; ``"auto"`` is the fastest one that is installed.
         ot_solver: A transport solver or a registered name, or ``"auto"``; it gives the priorities and, unless `objective` is given,
             the loss.
-        placer: A placer or a registered name.
-        objective: The loss; Wasserstein distance of the last step's particles to the goal where absent.
-        optimizer: Finds actions; defaults to `TrajectoryOptimizer()`.
+        placer: A placer or a registered name; what the task's settings say where absent, or else ``"transport"``.
+        objective: The loss; what the task's settings say where absent, or else the transport cost of the last step's particles
+            to the goal.
+        optimizer: Finds actions; defaults to `TrajectoryOptimizer` with the task's settings.
         device: Where a simulator given by name runs, ``"cpu"`` or ``"cuda"``.
         seed: Seed of first actions and random placements.
         stages: Number of stages; the task's own where absent.
@@ -73,16 +75,15 @@ def deform(
         simulator = registry.resolve("simulator", simulator, device=device)
     if isinstance(ot_solver, str):
         ot_solver = registry.resolve("ot_solver", ot_solver, device=device)
-    if isinstance(placer, str):
-        registry.find("placer", placer)
     task = load_task(task, registry=registry) if isinstance(task, str) else task
-    defaults = RunConfiguration()
+    defaults = with_task_settings(RunConfiguration(**({"placer": placer} if isinstance(placer, str) else {})), task)
+    placer = defaults.placer if placer is None else placer
     names = {"backend": _part_name(simulator), "ot": _part_name(ot_solver), "placer": _part_name(placer)}
-    used_placer: Placer = _part(placer, "placer", registry)
+    used_placer: Placer = _part(placer, "placer", registry, **defaults.placer_options)
     options = {"scene": task.scene, "batch_size": MAX_WORLDS, "device": device}
     used_simulator: Simulator = _part(simulator, "simulator", registry, **options)
     if objective is None:
-        objective = transport_objective(task, ot_solver, used_simulator, options=defaults.objective, registry=registry)
+        objective = make_objective(task, ot_solver, used_simulator, options=defaults.objective, registry=registry)
     used_solver: OTSolver = _part(ot_solver, "ot_solver", registry, blur=defaults.priorities.blur)
     planner = Planner(
         task=task,
@@ -131,8 +132,12 @@ def deform_configuration(
     """
     registry = registry or load_registry()
     check_names(configuration, registry=registry)
+    if resumption is None:
+        task = configured_task(configuration, registry=registry)
+        configuration = with_task_settings(configuration, task)
+    else:
+        task = resumption.task
     configuration = resolved(configuration, registry=registry)
-    task = configured_task(configuration, registry=registry) if resumption is None else resumption.task
     placer = registry.create("placer", configuration.placer, **configuration.placer_options)
     simulator_options = {"batch_size": MAX_WORLDS, **configuration.simulator_options}
     simulator = registry.create(
@@ -140,7 +145,7 @@ def deform_configuration(
     )
     solver_options = {"blur": configuration.priorities.blur, **configuration.ot_options}
     ot_solver = registry.create("ot_solver", configuration.ot, **solver_options)
-    objective = transport_objective(task, configuration.ot, simulator, options=configuration.objective, registry=registry)
+    objective = make_objective(task, configuration.ot, simulator, options=configuration.objective, registry=registry)
     planner = Planner(
         task=task,
         simulator=simulator,
@@ -189,38 +194,47 @@ def check_names(configuration: RunConfiguration, *, registry: Registry) -> None:
 
 
 def configured_task(configuration: RunConfiguration, *, registry: Registry) -> Task:
-    """Load a configuration's task and apply its changes of the scene.
+    """Load a configuration's task and apply its changes of the scene, the goal and the number of steps.
 
     Raises:
         InputError: The task or a change cannot be used.
     """
-    return changed_task(load_task(configuration.task, registry=registry), scene=configuration.scene)
+    task = load_task(configuration.task, registry=registry)
+    return changed_task(task, scene=configuration.scene, target=configuration.target, step_count=configuration.steps)
 
 
-def transport_objective(
+def make_objective(
     task: Task,
     ot_solver: OTSolver | str,
     simulator: Simulator,
     *,
     registry: Registry,
     options: ObjectiveConfiguration,
-) -> ObjectiveTransport:
-    """The default loss: transport cost from the last step's particles to the goal.
+) -> Objective:
+    """The loss that a configuration describes.
 
     Args:
         task: Its target is the goal.
         ot_solver: A solver used as it is, or a registered name, created with the blur of `options`.
         simulator: Gives device and type.
         registry: Where the name is looked up.
-        options: Subset size, blur, refresh schedule, contact weight.
+        options: Kind, subset size, blur, refresh schedule, contact weight.
     """
-    solver: OTSolver = _part(ot_solver, "ot_solver", registry, blur=options.blur)
     target = torch.as_tensor(task.load_target()).to(device=simulator.device, dtype=simulator.dtype)
+    if options.kind == "plasticinelab":
+        grid = task.load_target_grid()
+        return ObjectivePlasticineLab(
+            task.scene,
+            mass_grid(target, task.scene) if grid is None else torch.as_tensor(grid).to(target),
+            contact_weight=1.0 if options.contact_weight is None else options.contact_weight,
+            contact=options.contact,
+        )
+    solver: OTSolver = _part(ot_solver, "ot_solver", registry, blur=options.blur)
     return ObjectiveTransport(
         solver,
         target,
         scene=task.scene,
         points=options.points,
         refresh=options.refresh,
-        contact_weight=options.contact_weight,
+        contact_weight=options.contact_weight or 0.0,
     )

@@ -24,6 +24,7 @@ class Stage:
         target: Goal particles G (M, 3), length units.
         priorities: Transport priorities f (N,), cost units; nan where the placer declared that it needs none.
         generator: Source of randomness on the CPU, seeded by the run.
+        loss: Loss of leaving the state as it is, objective units; nan where it is unknown.
     """
 
     index: int
@@ -32,6 +33,7 @@ class Stage:
     target: Tensor
     priorities: Tensor
     generator: torch.Generator
+    loss: float = float("nan")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,6 +22,7 @@ from types import TracebackType
 from typing import Any
 
 import h5py
+import torch
 from torch import Tensor
 
 from cpdeform.core.configuration import RunConfiguration
@@ -112,6 +113,7 @@ class RunRecorder(Observer):
             }
             with replacing(self.directory / TARGET_FILE) as temporary, h5py.File(temporary, "w") as file:
                 write_dataset(file, "position", target, shape="particle, xyz", units="length (domain edge = 1)")
+                _write_target_grid(file, task)
             (self.directory / METRICS_FILE).write_text("", encoding="utf-8")
             self._write_run()
 
@@ -212,6 +214,15 @@ class RunRecorder(Observer):
             yield
         except OSError as error:
             raise RecordError(f"cannot write the run record in {self.directory}: {error.strerror or error}.") from error
+
+
+def _write_target_grid(file: h5py.File, task: Task) -> None:
+    """Keep the goal's own node masses, if it has any, so that a run which goes on is judged by the same goal."""
+    grid = task.load_target_grid()
+    if grid is not None:
+        cells = torch.nonzero(torch.as_tensor(grid))
+        write_dataset(file, "grid_cells", cells, shape="node, axis", units="index of a grid node")
+        write_dataset(file, "grid_mass", torch.as_tensor(grid)[tuple(cells.T)], shape="node", units="mass")
 
 
 def _origin(record: RunRecord | None) -> dict[str, Any] | None:

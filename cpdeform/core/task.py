@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import importlib.resources
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 import yaml
@@ -17,6 +15,19 @@ from pydantic import BaseModel, Field, ValidationError
 from cpdeform.core.errors import InputError, PluginError, UnknownNameError
 from cpdeform.core.plugins import Registry, load_registry
 from cpdeform.core.scene import FrozenModel, Scene
+from cpdeform.core.target import load_target, load_target_grid
+
+__all__ = [
+    "Task",
+    "changed_task",
+    "list_variants",
+    "load_target",
+    "load_task",
+    "merge",
+    "read_task",
+    "task_path",
+    "validate",
+]
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -32,6 +43,7 @@ class Task(FrozenModel):
         step_count: Environment steps T of one stage.
         stage_count: Number of stages that the task is meant for.
         metric: What the result is judged by.
+        settings: What a run of this task sets where the user does not: fields of `cpdeform.core.configuration.RunConfiguration`.
     """
 
     name: str
@@ -41,6 +53,7 @@ class Task(FrozenModel):
     step_count: int = Field(default=10, ge=1)
     stage_count: int = Field(default=1, ge=1)
     metric: Literal["incremental_iou", "wasserstein"] = "wasserstein"
+    settings: dict[str, Any] = Field(default_factory=dict)
 
     def load_target(self) -> NDArray[np.float64]:
         """Read the goal particles.
@@ -53,62 +66,16 @@ class Task(FrozenModel):
         """
         return load_target(self.target, scene=self.scene)
 
+    def load_target_grid(self) -> NDArray[np.float64] | None:
+        """Read the goal's own node masses, if its file holds them, as one imported from a grid does.
 
-def load_target(path: Path, *, scene: Scene) -> NDArray[np.float64]:
-    """Read target particles from ``.npz`` or ``.h5`` with an array ``position`` (M, 3), or from ``.npy`` with such an array.
+        Returns:
+            Node masses (G, G, G); None where the goal is given by its particles alone.
 
-    Integer arrays are positions in units of 2^-16 (compact files), others are in length units.
-
-    Args:
-        path: The file.
-        scene: Its domain must hold the target.
-
-    Returns:
-        Positions (M, 3), length units.
-
-    Raises:
-        InputError: The file is missing or unreadable, or holds something else than finite positions in the domain.
-    """
-    argument = f"target file {path}"
-    try:
-        # Opened here, since numpy leaves the file open where it turns out to be a damaged archive.
-        with path.open("rb") as file:
-            if path.suffix == ".h5":
-                values = _read_hdf5(file)
-            else:
-                loaded = np.load(file, allow_pickle=False)
-                values = np.asarray(loaded["position"] if isinstance(loaded, np.lib.npyio.NpzFile) else loaded)
-    except FileNotFoundError as error:
-        raise InputError(argument, came="no such file", expected="an .npz or .npy file of target particles") from error
-    except KeyError as error:
-        raise InputError(argument, came="no array of that name", expected='an array "position" of shape (M, 3)') from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(argument, came=f"unreadable content ({error})", expected="an .npz or .npy file of numbers") from error
-    if values.ndim != 2 or values.shape[1] != 3 or not len(values) or values.dtype.kind not in "fui":
-        raise InputError(argument, came=f"{values.dtype} of shape {values.shape}", expected="positions of shape (M, 3), M >= 1")
-    positions = values.astype(np.float64) * (1.0 if values.dtype.kind == "f" else 2.0**-16)
-    bad = int((~np.isfinite(positions)).any(axis=1).sum())
-    if bad:
-        came = f"{bad} particles with nan or infinity"
-        raise InputError(argument, came=came, expected="finite positions", remedy="Make the file anew.")
-    lower, upper = scene.domain
-    outside = int(((positions < np.asarray(lower) - 1e-4) | (positions > np.asarray(upper) + 1e-4)).any(axis=1).sum())
-    if outside:
-        raise InputError(
-            argument,
-            came=f"{outside} of {len(positions)} particles outside the domain",
-            expected=f"positions within {lower} and {upper}",
-            remedy="Scale or shift the target.",
-        )
-    return positions
-
-
-def _read_hdf5(file: BinaryIO) -> NDArray[Any]:
-    """The array ``position`` of an HDF5 file, such as the goal of a run record."""
-    import h5py
-
-    with h5py.File(file, "r") as content:
-        return np.asarray(content["position"])
+        Raises:
+            InputError: The file is missing or unreadable, or the masses do not fit the scene's grid.
+        """
+        return load_target_grid(self.target, scene=self.scene)
 
 
 def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -245,15 +212,25 @@ def read_task(path: Path, *, variant: str | None = None) -> Task:
     return validate(Task, content, source=f"task file {path}")
 
 
-def changed_task(task: Task, *, scene: Mapping[str, Any]) -> Task:
-    """The task with changes of its scene, nested as `merge` takes them.
+def changed_task(
+    task: Task, *, scene: Mapping[str, Any] | None = None, target: Path | None = None, step_count: int | None = None
+) -> Task:
+    """The task with changes.
+
+    Args:
+        task: The task.
+        scene: Changes of its scene, nested as `merge` takes them.
+        target: Another file of its goal.
+        step_count: Another number of environment steps of a stage.
 
     Raises:
         InputError: A change does not fit.
     """
-    if not scene:
+    changes = {"scene": scene or None, "target": target, "step_count": step_count}
+    changes = {field: change for field, change in changes.items() if change is not None}
+    if not changes:
         return task
-    return validate(Task, merge(task.model_dump(), {"scene": scene}), source=f"task {task.name} with --set")
+    return validate(Task, merge(task.model_dump(), changes), source=f"task {task.name} with --set")
 
 
 def list_variants(path: Path) -> list[str]:

@@ -118,7 +118,8 @@ def bench_run(settings: RunBenchSettings, *, registry: Registry) -> Iterator[dic
 def _row(configuration: RunConfiguration, settings: RunBenchSettings) -> dict[str, Any]:
     row: dict[str, Any] = {name: getattr(configuration, name) for name in ("task", "backend", "device", "seed")}
     row |= {"solver": configuration.ot, "threads": settings.threads, **dict.fromkeys(MEASURED)}
-    return measured(row, RUN, configuration.model_dump(mode="json"), threads=settings.threads, timeout=settings.timeout)
+    request = configuration.model_dump(mode="json", exclude_unset=True)
+    return measured(row, RUN, request, threads=settings.threads, timeout=settings.timeout)
 
 
 def run(request: dict[str, Any]) -> dict[str, Any]:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.placer import Stage
-from cpdeform.core.rotation import rotate, rotate_inverse
+from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Manipulator
-from cpdeform.core.signed_distance import local_distance, signed_distance
+from cpdeform.core.signed_distance import signed_distance
 from cpdeform.placement.tool import surface_points, tool_half_extents
-
-CHUNK_DISTANCES = 2**18
-"""Distances computed at once: small enough for the temporaries to stay in a processor's cache."""
+from cpdeform.placement.touch import CHUNK_DISTANCES, reduce_distances, smallest_gaps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,19 +63,16 @@ class GridResult:
     cost: float
 
 
-def movable_manipulator(stage: Stage) -> int:
-    """Index of the scene's only movable tool.
+def movable_manipulators(stage: Stage) -> list[int]:
+    """Indices of the scene's movable tools.
 
     Raises:
-        CapabilityError: The scene has none or several.
+        CapabilityError: The scene has none.
     """
     movable = [index for index, manipulator in enumerate(stage.scene.manipulators) if manipulator.movable]
-    if len(movable) != 1:
-        raise CapabilityError(
-            f"This placer places exactly one movable tool, the scene has {len(movable)}; use the placer fixed, "
-            "or set the action_scale of the other tools to []."
-        )
-    return movable[0]
+    if not movable:
+        raise CapabilityError("The scene has no movable tool to be placed; give one a positive action_scale.")
+    return movable
 
 
 class ToolGrid:
@@ -87,24 +82,35 @@ class ToolGrid:
         stage: Body, tools and bounds.
         index: Which tool is moved.
         options: How finely to search.
+        poses: Poses (M, 8) of all tools; those of the state where absent.
+        obstacles: Indices of the tools that must not be touched; all others where absent.
 
     Raises:
         InputError: The stage's state holds several worlds.
     """
 
-    def __init__(self, stage: Stage, index: int, options: GridOptions) -> None:
+    def __init__(
+        self,
+        stage: Stage,
+        index: int,
+        options: GridOptions,
+        *,
+        poses: Tensor | None = None,
+        obstacles: Sequence[int] | None = None,
+    ) -> None:
         if stage.state.batch_size != 1:
             raise InputError("stage.state", came=f"{stage.state.batch_size} worlds", expected="a single world")
         self.options = options
         self.manipulator: Manipulator = stage.scene.manipulators[index]
         self.particles = stage.state.position[0].detach()
-        poses = stage.state.manipulator_pose[0].detach()
+        poses = stage.state.manipulator_pose[0].detach() if poses is None else poses
         self.index, self.poses, self.quaternion = index, poses, poses[index, 3:7]
         self.half_extents = tool_half_extents(self.manipulator, self.quaternion)
         self._lower = poses.new_tensor(self.manipulator.lower_bound)
         self._upper = poses.new_tensor(self.manipulator.upper_bound)
         self._surface = surface_points(self.manipulator).to(poses)
-        self._fixed = [(tool, poses[other]) for other, tool in enumerate(stage.scene.manipulators) if other != index]
+        others = [other for other in range(len(stage.scene.manipulators)) if other != index] if obstacles is None else obstacles
+        self._fixed = [(stage.scene.manipulators[other], poses[other]) for other in others]
         clouds = [rotate(pose[3:7], surface_points(tool, resolution=24).to(poses)) + pose[:3] for tool, pose in self._fixed]
         self._obstacles = torch.cat(clouds) if clouds else self.particles[:0]
 
@@ -125,13 +131,7 @@ class ToolGrid:
         Returns:
             Numbers (G,).
         """
-        local_points = rotate_inverse(self.quaternion, points).unbind(-1)
-        step = max(1, CHUNK_DISTANCES // max(1, points.shape[0]))
-        parts = []
-        for chunk in torch.split(rotate_inverse(self.quaternion, positions), step):
-            axes = [point - origin.unsqueeze(-1) for point, origin in zip(local_points, chunk.unbind(-1), strict=True)]
-            parts.append(reduction(local_distance(self.manipulator, *axes)))
-        return torch.cat(parts) if parts else positions.new_empty(0)
+        return reduce_distances(self.manipulator, self.quaternion, positions, points, reduction)
 
     def smallest_gap(self, position: Tensor) -> float:
         """Distance between the tool's surface at `position` (3,) and the nearest particle, length units."""
@@ -166,14 +166,8 @@ class ToolGrid:
 
     def _gaps(self, positions: Tensor, points: Tensor, reach: float = 0.0) -> Tensor:
         """Distance (G,) between the tool and the nearest of the points (P, 3); exact up to `reach` or the clearance."""
-        if not positions.shape[0]:
-            return positions.new_empty(0)
-        # Only what lies in the box swept by the tool can be that near.
-        reach_box = self.half_extents + max(reach, self.options.clearance)
-        near = ((points >= positions.amin(0) - reach_box) & (points <= positions.amax(0) + reach_box)).all(dim=-1)
-        if not bool(near.any()):
-            return torch.full_like(positions[:, 0], torch.inf)
-        return self.reduce(positions, points[near], lambda distance: distance.amin(dim=-1))
+        reach = max(reach, self.options.clearance)
+        return smallest_gaps(self.manipulator, self.quaternion, positions, points, reach=reach)
 
     def search(self, contact: Tensor, cost: Callable[[Tensor], Tensor], *, tolerance: float = 0.0) -> GridResult | None:
         """Find the feasible position of lowest cost around a contact point.

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Placement, Placer, PlacerCapabilities, Stage
-from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulator
+from cpdeform.core.scene import Manipulator, Vector3
+from cpdeform.placement.grasp import TOOLS_PER_GRASP, GraspSearch
+from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulators
+from cpdeform.placement.pose import GRASP_DIRECTIONS
+from cpdeform.placement.touch import reduce_distances
 
 SURFACE_NEIGHBOURS = 48
 SURFACE_OFFSET = 0.25
@@ -16,10 +22,11 @@ is 3/8; inside a body sampled at random it is 0 with a standard deviation of 0.0
 
 
 class PlacerRandom(Placer):
-    """Places one tool at randomly drawn surface particles, touching, free of collision.
+    """Places the tools at randomly drawn surface particles, touching, free of collision.
 
     Each candidate draws surface particles (see `surface_particles`) until the tool can be placed as near to one as
-    collision allows, touching the body; its rotation is kept.
+    collision allows, touching the body; its rotation is kept. Several tools are placed in pairs that face each other through
+    such a particle, along one of the three directions of `PlacerTransport`, drawn for each candidate.
 
     Args:
         candidates: Number of placements.
@@ -37,7 +44,7 @@ class PlacerRandom(Placer):
         Li et al., "Contact Points Discovery for Soft-Body Manipulations with Differentiable Physics", ICLR 2022.
     """
 
-    capabilities = PlacerCapabilities(needs_priorities=False, max_manipulators=1)
+    capabilities = PlacerCapabilities(needs_priorities=False, max_manipulators=None)
 
     def __init__(
         self,
@@ -62,20 +69,48 @@ class PlacerRandom(Placer):
         """Propose `candidates` placements, fewer where no drawn particle can be touched.
 
         Raises:
-            CapabilityError: The scene has not exactly one movable tool.
+            CapabilityError: The scene has no movable tool.
         """
-        grid = ToolGrid(stage, movable_manipulator(stage), self.options)
-        surface = surface_particles(grid.particles)
+        movable = movable_manipulators(stage)
+        surface = surface_particles(stage.state.position[0].detach())
         placements = []
         for number in range(self.candidates):
-            placement = self._draw(grid, surface, stage.generator, f"random-{number + 1}")
+            label = f"random-{number + 1}"
+            if len(movable) == 1:
+                placement = self._draw(ToolGrid(stage, movable[0], self.options), surface, stage.generator, label)
+            else:
+                placement = self._draw_grasps(stage, movable, surface, label)
             if placement is not None:
                 placements.append(placement)
         return placements
 
+    def _draw_grasps(self, stage: Stage, movable: Sequence[int], surface: Tensor, label: str) -> Placement | None:
+        particles = stage.state.position[0].detach()
+        search = GraspSearch(manipulators=stage.scene.manipulators, particles=particles, clearance=self.options.clearance)
+        poses, first = stage.state.manipulator_pose[0].detach().clone(), None
+        placed = [index for index in range(len(stage.scene.manipulators)) if index not in movable]
+        for start in range(0, len(movable), TOOLS_PER_GRASP):
+            tools = movable[start : start + TOOLS_PER_GRASP]
+            grasp = None
+            for _ in range(self.attempts):
+                particle = _draw_one(surface, stage.generator)
+                direction = torch.tensor(_draw_direction(stage.generator)).to(particles)
+                point = particles[particle]
+
+                def gap(tool: Manipulator, quaternion: Tensor, positions: Tensor, point: Tensor = point) -> Tensor:
+                    return reduce_distances(tool, quaternion, positions, point.unsqueeze(0), lambda distance: distance[:, 0])
+
+                grasp = search.find(poses, tools, placed, point, direction, gap)
+                if grasp is not None:
+                    break
+            if grasp is None:
+                return None
+            poses, placed, first = grasp.poses, [*placed, *tools], particle if first is None else first
+        return Placement(pose=poses, score=float("nan"), label=label, contact_particle=first)
+
     def _draw(self, grid: ToolGrid, surface: Tensor, generator: torch.Generator, label: str) -> Placement | None:
         for _ in range(self.attempts):
-            particle = int(surface[int(torch.randint(surface.shape[0], (1,), generator=generator))])
+            particle = _draw_one(surface, generator)
             point = grid.particles[particle]
 
             def gap(positions: Tensor, point: Tensor = point) -> Tensor:
@@ -86,6 +121,15 @@ class PlacerRandom(Placer):
                 pose = grid.pose_at(found.position)
                 return Placement(pose=pose, score=float("nan"), label=label, contact_particle=particle)
         return None
+
+
+def _draw_one(surface: Tensor, generator: torch.Generator) -> int:
+    return int(surface[int(torch.randint(surface.shape[0], (1,), generator=generator))])
+
+
+def _draw_direction(generator: torch.Generator) -> Vector3:
+    directions = list(GRASP_DIRECTIONS.values())
+    return directions[int(torch.randint(len(directions), (1,), generator=generator))]
 
 
 def surface_particles(positions: Tensor) -> Tensor:

@@ -1,46 +1,70 @@
-"""The paper's placer: the tool goes where the body has to move most."""
+"""The paper's placer: the tools go where the body has to move most."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.placer import Placement, Placer, PlacerCapabilities, Stage
-from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulator
+from cpdeform.core.placer import Placement, PlacementResult, Placer, PlacerCapabilities, Stage
+from cpdeform.core.scene import Manipulator
+from cpdeform.core.signed_distance import signed_distance
+from cpdeform.placement.grasp import TOOLS_PER_GRASP, Cost, GraspSearch
+from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulators
+from cpdeform.placement.pose import APART, CURRENT, DIRECT, GRASP_DIRECTIONS, check_poses
+from cpdeform.placement.priorities import Exploration
+from cpdeform.placement.tool import tool_half_extents
+from cpdeform.placement.touch import reduce_distances
+
+CURRENT_DEPTH = 1e-3
+"""How deep a tool that stays where it is may reach into the body, length units."""
 
 
 class PlacerTransport(Placer):
-    """Places one tool around the particle of largest transport priority, free of collision, where its score is highest.
+    """Places the tools around the particle of largest transport priority, free of collision, where their score is highest.
 
     With priorities f_i and the distance d_i(x) of particle i to the surface of the tool at position x, the score is
-    1/N sum_i f_i / (d_i(x)^2 + 1), maximised over a grid of positions x around that particle and then over finer grids
-    around the best. Distances count in units of `distance_scale`. With a scale of 1, the domain's edge, d^2 << 1 for every
-    particle: the score is flat, far particles' small priorities outweigh the tool's neighbourhood, and on a board with one
-    stroke the tool lands in a corner of the grid. The default, a tool's radius, makes the neighbourhood count.
+    1/N sum_i f_i / (d_i(x)^2 + 1). A single tool is placed on a grid of positions x around that particle and then on finer
+    grids around the best. Several tools are placed in pairs, once per pose: of the positions that face the particle along the
+    pose's direction and touch, the first tool takes that of the best score; the second one goes to the nearest position free
+    of collision on the body's other side. Boxes turn to press their broadest face. Of several bodies that of the highest mean
+    priority comes first, and further pairs take the next ones. The floor is no obstacle to tools, as in PlasticineLab.
 
-    The score depends on the gauge of the priorities, which is fixed by `OTResult`: zero weighted median.
+    Distances count in units of `distance_scale`. With a scale of 1, the domain's edge, d^2 << 1 for every particle: the score is
+    flat, far particles' small priorities outweigh the tool's neighbourhood, and on a board with one stroke the tool lands in a
+    corner of the grid. The default, a tool's radius, makes the neighbourhood count. The score depends on the gauge of the
+    priorities, which is fixed by `OTResult`: zero weighted median.
+
+    Where no candidate of a stage lowers the loss, the particles around the contact point count as explored, and the next body
+    or the next priority is tried.
 
     Args:
-        grid_size: Positions along each axis of every grid (the paper: 20).
+        grid_size: Positions along each axis of a single tool's grids (the paper: 20).
         refinements: Number of finer grids. A tool acts on the clay only within about 0.0035 of its surface, less than the
             first grid's spacing: without refinement the plan's gradient may be zero.
-        clearance: Least distance between the tool and any particle, length units.
-        margin: How far beyond touching the particle the first grid reaches, length units; half of the tool's smallest half
-            extent where absent.
+        clearance: Least distance between a tool and any particle, length units.
+        margin: How far beyond touching the particle a single tool's first grid reaches, length units; half of the tool's
+            smallest half extent where absent.
         distance_scale: Length that the score measures distances in; 1 is the paper's formula to the letter.
-        max_gap: Largest distance between tool and body beyond `clearance`, length units. The paper leaves this to the
-            score, which pushes the tool off the body where priorities are negative; None does the same.
+        max_gap: Largest distance between a single tool and the body beyond `clearance`, length units. The paper leaves this to
+            the score, which pushes the tool off the body where priorities are negative; None does the same.
+        poses: Candidates: ``"left-right"``, ``"top-bottom"``, ``"front-back"`` (along x, y, z), ``"direct"`` (a single tool,
+            its rotation kept), ``"apart"`` (every tool at a contact point of its own) and ``"current"`` (tools stay, unless they
+            reach into the body). Where absent ``"direct"`` for one movable tool, the first three for several.
+        attempts: The most rounds of candidates in a stage.
+        contacts: Contact points proposed in one round.
 
     Raises:
         InputError: An option is out of range.
 
     References:
-        Li et al., "Contact Points Discovery for Soft-Body Manipulations with Differentiable Physics", ICLR 2022, section
-        "Direct Single Manipulator Placement".
+        Li et al., "Contact Points Discovery for Soft-Body Manipulations with Differentiable Physics", ICLR 2022, sections
+        "Direct Single Manipulator Placement" and "Multiple Manipulator Placement With Heuristic".
     """
 
-    capabilities = PlacerCapabilities(needs_priorities=True, max_manipulators=1)
+    capabilities = PlacerCapabilities(needs_priorities=True, max_manipulators=None)
 
     def __init__(
         self,
@@ -51,45 +75,175 @@ class PlacerTransport(Placer):
         margin: float | None = None,
         distance_scale: float = 0.03,
         max_gap: float | None = 0.0005,
+        poses: Sequence[str] | None = None,
+        attempts: int = 3,
+        contacts: int = 1,
     ) -> None:
         if not 0.0 < distance_scale < float("inf"):
             raise InputError("distance_scale", came=str(distance_scale), expected="a finite number above 0")
+        for name, number in (("attempts", attempts), ("contacts", contacts)):
+            if number < 1:
+                raise InputError(name, came=str(number), expected="at least 1")
         self.options = GridOptions(
             grid_size=grid_size, refinements=refinements, clearance=clearance, margin=margin, max_gap=max_gap
         )
-        self.distance_scale = distance_scale
+        self.distance_scale, self.attempts, self.contacts = distance_scale, attempts, contacts
+        self.poses = check_poses(poses)
+        self._exploration: Exploration | None = None
 
     def ask(self, stage: Stage) -> list[Placement]:
-        """Propose one placement of the only movable tool; its rotation is kept.
+        """Propose a placement per pose, around contact points that were not proposed before in this stage.
 
         Returns:
-            One placement; none where every position around the particle collides, is out of the tool's bounds or does not touch.
+            Placements; none where every position collides, is out of the tools' bounds or does not touch.
 
         Raises:
-            CapabilityError: The scene has not exactly one movable tool.
+            CapabilityError: The scene has no movable tool.
             InputError: The priorities are not finite, or do not fit the particles.
         """
-        grid = ToolGrid(stage, movable_manipulator(stage), self.options)
-        priorities = stage.priorities.detach().to(grid.particles)
-        if priorities.shape != grid.particles.shape[:1] or not bool(torch.isfinite(priorities).all()):
-            raise InputError(
-                "stage.priorities",
-                came=f"shape {tuple(priorities.shape)}, {int((~torch.isfinite(priorities)).sum())} not finite",
-                expected=f"{grid.particles.shape[0]} finite priorities",
-            )
-        contact = int(priorities.argmax())
-        weighted = priorities != 0.0
-        particles, weights = grid.particles[weighted], priorities[weighted] / priorities.shape[0]
+        movable = movable_manipulators(stage)
+        if self._exploration is None or self._exploration.stage is not stage:
+            self._exploration = Exploration.begin(stage)
+        exploration = self._exploration
+        placements: list[Placement] = []
+        while not placements and exploration.attempt < self.attempts * self.contacts:
+            for _ in range(self.contacts):
+                # What depends on no contact point is proposed once.
+                placements += self._round(exploration, movable, first=exploration.attempt == 0)
+                exploration.attempt += 1
+        return placements
 
-        def penalty(positions: Tensor) -> Tensor:
-            return grid.reduce(positions, particles, lambda distance: score_loss(distance, weights, self.distance_scale))
+    def tell(self, results: list[PlacementResult]) -> bool:
+        """Ask again as long as nothing lowered the loss and attempts are left."""
+        exploration = self._exploration
+        if exploration is None or exploration.attempt >= self.attempts * self.contacts:
+            return False
+        return not any(result.loss < exploration.stage.loss for result in results)
 
-        noise = 4.0 * torch.finfo(weights.dtype).eps * float(weights.abs().sum()) * float(grid.half_extents.max()) ** 2
-        found = grid.search(grid.particles[contact], penalty, tolerance=noise)
-        if found is None:
+    def _round(self, exploration: Exploration, movable: Sequence[int], *, first: bool) -> list[Placement]:
+        """Candidates around the next contact point, whose surroundings then count as explored."""
+        stage, ranking = exploration.stage, exploration.ranking
+        body = ranking[exploration.attempt % len(ranking)]
+        contact = exploration.contact(body)
+        if contact is None:
             return []
-        score = float(priorities.double().mean()) - found.cost
-        return [Placement(pose=grid.pose_at(found.position), score=score, label="direct", contact_particle=contact)]
+        found = []
+        for pose in self.poses or ((DIRECT,) if len(movable) == 1 else tuple(GRASP_DIRECTIONS)):
+            if pose == CURRENT:
+                found.append(_stay(stage) if first else None)
+            elif pose in GRASP_DIRECTIONS:
+                found.append(self._grasps(exploration, movable, pose, contact))
+            elif pose == APART or len(movable) > 1:
+                found.append(self._apart(exploration, movable, pose, contact))
+            else:
+                found.append(self._direct(exploration, movable[0], contact))
+        width = min(_half_width(stage.scene.manipulators[index]) for index in movable)
+        exploration.explored |= exploration.near(contact, width)
+        return [placement for placement in found if placement is not None]
+
+    def _cost(self, exploration: Exploration) -> Cost:
+        """What the score loses, for tools at given positions."""
+        particles, priorities = exploration.stage.state.position[0].detach(), exploration.priorities
+        weighted = priorities != 0.0
+        points, weights = particles[weighted], priorities[weighted] / priorities.shape[0]
+
+        def cost(manipulator: Manipulator, quaternion: Tensor, positions: Tensor) -> Tensor:
+            return reduce_distances(
+                manipulator, quaternion, positions, points, lambda distance: score_loss(distance, weights, self.distance_scale)
+            )
+
+        return cost
+
+    def _score(self, exploration: Exploration, cost: float) -> float:
+        return float(exploration.priorities.double().mean()) - cost
+
+    def _direct(self, exploration: Exploration, index: int, contact: int) -> Placement | None:
+        """One tool, its rotation kept, wherever around the particle its score is best."""
+        grid = ToolGrid(exploration.stage, index, self.options)
+        found = self._search(exploration, grid, contact)
+        if found is None:
+            return None
+        pose, cost = found
+        return Placement(pose=pose, score=self._score(exploration, cost), label=DIRECT, contact_particle=contact)
+
+    def _search(self, exploration: Exploration, grid: ToolGrid, contact: int) -> tuple[Tensor, float] | None:
+        """Poses (M, 8) with the grid's tool at its best position, and the cost there."""
+        cost, weights = self._cost(exploration), exploration.priorities / exploration.priorities.shape[0]
+        noise = 4.0 * torch.finfo(weights.dtype).eps * float(weights.abs().sum()) * float(grid.half_extents.max()) ** 2
+        found = grid.search(
+            grid.particles[contact], lambda positions: cost(grid.manipulator, grid.quaternion, positions), tolerance=noise
+        )
+        return None if found is None else (grid.pose_at(found.position), found.cost)
+
+    def _grasps(self, exploration: Exploration, movable: Sequence[int], pose: str, contact: int) -> Placement | None:
+        """All tools in pairs that face each other along the pose's direction, each pair around a contact point of its own."""
+        stage = exploration.stage
+        particles = stage.state.position[0].detach()
+        search = GraspSearch(manipulators=stage.scene.manipulators, particles=particles, clearance=self.options.clearance)
+        direction = torch.tensor(GRASP_DIRECTIONS[pose]).to(particles)
+        poses, cost = stage.state.manipulator_pose[0].detach().clone(), self._cost(exploration)
+        placed = [index for index in range(len(stage.scene.manipulators)) if index not in movable]
+        pairs = [movable[start : start + TOOLS_PER_GRASP] for start in range(0, len(movable), TOOLS_PER_GRASP)]
+        costs = []
+        for tools, point in zip(pairs, self._contacts(exploration, contact), strict=False):
+            grasp = search.find(poses, tools, placed, particles[point], direction, cost)
+            if grasp is None:
+                return None
+            poses, placed = grasp.poses, [*placed, *tools]
+            costs.append(grasp.cost)
+        if len(costs) < len(pairs):
+            return None
+        score = self._score(exploration, sum(costs) / len(costs))
+        return Placement(pose=poses, score=score, label=pose, contact_particle=contact)
+
+    def _apart(self, exploration: Exploration, movable: Sequence[int], label: str, contact: int) -> Placement | None:
+        """Every tool as a single one, at a contact point of its own."""
+        stage = exploration.stage
+        poses, costs = stage.state.manipulator_pose[0].detach().clone(), []
+        placed = [index for index in range(len(stage.scene.manipulators)) if index not in movable]
+        points = self._contacts(exploration, contact)
+        for index in movable:
+            found = None
+            while found is None:
+                point = next(points, None)
+                if point is None:
+                    return None
+                grid = ToolGrid(stage, index, self.options, poses=poses, obstacles=placed)
+                found = self._search(exploration, grid, point)
+            poses, placed = found[0], [*placed, index]
+            costs.append(found[1])
+        score = self._score(exploration, sum(costs) / len(costs))
+        return Placement(pose=poses, score=score, label=label, contact_particle=contact)
+
+    def _contacts(self, exploration: Exploration, contact: int) -> Iterator[int]:
+        """The contact point, then that of the next body in the ranking and so on; on each body away from those before."""
+        ranking = exploration.ranking
+        widest = max(_half_width(tool, widest=True) for tool in exploration.stage.scene.manipulators if tool.movable)
+        taken = exploration.near(contact, 2.0 * widest)
+        yield contact
+        number, empty = ranking.index(int(exploration.bodies[contact])), 0
+        while empty < len(ranking):
+            number += 1
+            following = exploration.contact(ranking[number % len(ranking)], excluded=taken)
+            empty = empty + 1 if following is None else 0
+            if following is not None:
+                taken |= exploration.near(following, 2.0 * widest)
+                yield following
+
+
+def _stay(stage: Stage) -> Placement | None:
+    """The tools where they are, unless one reaches into the body."""
+    poses = stage.state.manipulator_pose[0].detach()
+    for manipulator, pose in zip(stage.scene.manipulators, poses, strict=True):
+        if manipulator.movable and float(signed_distance(manipulator, pose, stage.state.position[0]).min()) < -CURRENT_DEPTH:
+            return None
+    return Placement(pose=poses.clone(), score=float("nan"), label=CURRENT)
+
+
+def _half_width(manipulator: Manipulator, *, widest: bool = False) -> float:
+    """Half of a tool's smallest or largest width, length units."""
+    half = tool_half_extents(manipulator, torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    return float(half.max() if widest else half.min())
 
 
 def score_loss(distance: Tensor, weights: Tensor, distance_scale: float = 1.0) -> Tensor:

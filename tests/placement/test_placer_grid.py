@@ -12,7 +12,7 @@ from cpdeform.core.placer import Stage
 from cpdeform.core.scene import BodyBox, Manipulator, ManipulatorBox, ManipulatorCylinder, ManipulatorSphere, Scene
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
-from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulator
+from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulators
 
 MOVES = (0.01, 0.01, 0.01)
 
@@ -117,11 +117,11 @@ def test_memory_pieces_do_not_change_the_distances(monkeypatch: pytest.MonkeyPat
     assert torch.equal(grid.reduce(lattice(4), grid.particles, lambda distance: distance.amin(dim=-1)), whole)
 
 
-def test_one_movable_tool_is_needed() -> None:
-    assert movable_manipulator(stage(ball(action_scale=()), ball())) == 1
-    for tools in ((ball(action_scale=()),), (ball(), ball())):
-        with pytest.raises(CapabilityError, match="exactly one movable tool"):
-            movable_manipulator(stage(*tools))
+def test_movable_tools_are_found() -> None:
+    assert movable_manipulators(stage(ball(action_scale=()), ball())) == [1]
+    assert movable_manipulators(stage(ball(), ball())) == [0, 1]
+    with pytest.raises(CapabilityError, match="no movable tool"):
+        movable_manipulators(stage(ball(action_scale=())))
 
 
 @pytest.mark.parametrize(

@@ -121,5 +121,5 @@ def test_unusable_inputs_are_named() -> None:
         PlacerTransport().ask(stage)
     with pytest.raises(InputError, match="distance_scale: got 0"):
         PlacerTransport(distance_scale=0.0)
-    with pytest.raises(CapabilityError, match="the scene has 0"):
+    with pytest.raises(CapabilityError, match="no movable tool"):
         PlacerTransport().ask(board(100, action_scale=()))

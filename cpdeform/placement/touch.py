@@ -1,0 +1,124 @@
+"""Moving a tool straight out of a body until it just touches, exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from cpdeform.core.rotation import rotate_inverse
+from cpdeform.core.scene import Manipulator
+from cpdeform.core.signed_distance import local_distance
+from cpdeform.placement.tool import tool_half_extents
+
+CHUNK_DISTANCES = 2**18
+"""Distances computed at once: small enough for the temporaries to stay in a processor's cache."""
+
+SMALLEST_STEP = 1e-3
+"""The least a tool is moved at a time on its way out, length units."""
+
+MOST_STEPS = 64
+"""Steps after which a tool that is still not free is given up: it slides along the surface."""
+
+BISECTIONS = 12
+"""Halvings of the last step; they leave the tool within 1/4096 of it of touching."""
+
+GRAZING_DEPTH = 0.5
+"""Depth at the start, in the tool's half smallest width, below which it only grazes the points and would not press on them."""
+
+
+def reduce_distances(
+    manipulator: Manipulator, quaternion: Tensor, positions: Tensor, points: Tensor, reduction: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Reduce the distances of points to a tool at each of several positions, in bounded memory.
+
+    Args:
+        manipulator: The tool, at its start gap.
+        quaternion: Its rotation (4,), unit quaternion wxyz.
+        positions: Tool positions (G, 3), length units.
+        points: Points (P, 3), length units.
+        reduction: Maps distances (g, P) of a piece of the positions to numbers (g,).
+
+    Returns:
+        Numbers (G,).
+    """
+    local_points = rotate_inverse(quaternion, points).unbind(-1)
+    step = max(1, CHUNK_DISTANCES // max(1, points.shape[0]))
+    parts = []
+    for chunk in torch.split(rotate_inverse(quaternion, positions), step):
+        axes = [point - origin.unsqueeze(-1) for point, origin in zip(local_points, chunk.unbind(-1), strict=True)]
+        parts.append(reduction(local_distance(manipulator, *axes)))
+    return torch.cat(parts) if parts else positions.new_empty(0)
+
+
+def smallest_gaps(manipulator: Manipulator, quaternion: Tensor, positions: Tensor, points: Tensor, *, reach: float = 0.0) -> Tensor:
+    """Distance (G,) between a tool at each position (G, 3) and the nearest of the points (P, 3); exact up to `reach`.
+
+    A larger distance may come out as infinity.
+    """
+    if not positions.shape[0]:
+        return positions.new_empty(0)
+    # Only what lies in the box swept by the tool can be that near.
+    box = tool_half_extents(manipulator, quaternion) + reach
+    near = ((points >= positions.amin(0) - box) & (points <= positions.amax(0) + box)).all(dim=-1)
+    if not bool(near.any()):
+        return torch.full_like(positions[:, 0], torch.inf)
+    return reduce_distances(manipulator, quaternion, positions, points[near], lambda distance: distance.amin(dim=-1))
+
+
+def exit_distances(
+    manipulator: Manipulator,
+    quaternion: Tensor,
+    starts: Tensor,
+    direction: Tensor,
+    points: Tensor,
+    *,
+    reach: float,
+    clearance: float = 0.0,
+) -> Tensor:
+    """How far a tool has to move along a direction until it is free of all points for the first time.
+
+    Since a distance changes by no more than the tool moves, a tool that reaches a depth into the points is not free before it
+    has moved by that depth: such steps never pass over a gap that is wide enough for the tool.
+
+    Args:
+        manipulator: The tool.
+        quaternion: Its rotation (4,), unit quaternion wxyz.
+        starts: Positions (G, 3) to start from, length units.
+        direction: Unit vector (3,).
+        points: Points (P, 3) to get free of, length units.
+        reach: The farthest to move, length units.
+        clearance: Distance that counts as free, length units.
+
+    Returns:
+        Distances (G,), length units, at which the tool is free and touches; infinity where it is not free within `reach`, or
+        hardly touches at its start.
+    """
+    lengths = torch.full_like(starts[:, 0], torch.inf)
+    depth = GRAZING_DEPTH * float(tool_half_extents(manipulator, quaternion).min())
+    gaps = smallest_gaps(manipulator, quaternion, starts, points)
+    active = torch.nonzero(gaps <= -depth).flatten()
+    moved, gaps, steps = torch.zeros_like(gaps)[active], gaps[active], torch.zeros_like(gaps)
+
+    def gaps_at(lines: Tensor, distances: Tensor) -> Tensor:
+        positions = starts[lines] + distances.unsqueeze(-1) * direction
+        return smallest_gaps(manipulator, quaternion, positions, points, reach=clearance)
+
+    for _ in range(MOST_STEPS):
+        step = (clearance - gaps).clamp(min=SMALLEST_STEP)
+        moved = moved + step
+        gaps = gaps_at(active, moved)
+        free = gaps >= clearance
+        lengths[active[free]], steps[active[free]] = moved[free], step[free]
+        going = ~free & (moved <= reach)
+        active, moved, gaps = active[going], moved[going], gaps[going]
+        if not active.numel():
+            break
+    found = torch.nonzero(torch.isfinite(lengths)).flatten()
+    high, step = lengths[found], steps[found]
+    for _ in range(BISECTIONS):
+        step = 0.5 * step
+        high = torch.where(gaps_at(found, high - step) >= clearance, high - step, high)
+    lengths[found] = high
+    return lengths
