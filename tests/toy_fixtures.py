@@ -15,15 +15,19 @@ TOYS = Path(__file__).parent / "toys"
 sys.path.insert(0, str(TOYS))
 
 
-@pytest.fixture
-def toy_distribution(tmp_path: Path) -> Path:
+def write_toy_distribution(directory: Path) -> Path:
     """A folder with the metadata of an installed distribution `cpdeform-toy`; on sys.path it makes the toys discoverable."""
-    site = tmp_path / "site"
+    site = directory / "site"
     metadata = site / "cpdeform_toy-0.1.dist-info"
     metadata.mkdir(parents=True)
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: cpdeform-toy\nVersion: 0.1\n")
     (metadata / "entry_points.txt").write_text("[cpdeform]\ntoy = cpdeform_toy.plugin\n")
     return site
+
+
+@pytest.fixture
+def toy_distribution(tmp_path: Path) -> Path:
+    return write_toy_distribution(tmp_path)
 
 
 @pytest.fixture

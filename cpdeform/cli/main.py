@@ -12,8 +12,11 @@ from typer.core import TyperGroup
 from cpdeform import __version__
 from cpdeform.cli.bench import bench
 from cpdeform.cli.check import check
+from cpdeform.cli.evaluate import evaluate
+from cpdeform.cli.experiment import experiment
 from cpdeform.cli.plugins import plugins
 from cpdeform.cli.run import run
+from cpdeform.cli.task import task
 from cpdeform.cli.tasks import tasks
 from cpdeform.core.errors import CpdeformError
 
@@ -50,10 +53,13 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command()(run)
+app.command()(evaluate)
 app.command()(tasks)
 app.command()(plugins)
+app.add_typer(task, name="task")
 app.add_typer(bench, name="bench")
 app.add_typer(check, name="check")
+app.add_typer(experiment, name="experiment")
 
 
 def _show_version(wanted: bool) -> None:

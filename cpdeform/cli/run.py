@@ -237,6 +237,7 @@ def _summary(
         "loss_initial": result.loss_initial,
         "loss_final": result.loss_final,
         "metric": result.metric_name,
+        "metric_initial": result.metric_initial,
         "metric_value": result.metric_value,
         "stages": _finished(result),
         "gradient_evaluations": result.gradient_evaluations,
@@ -255,7 +256,7 @@ def _print_summary(result: DeformResult, directory: Path, picture: Path | None, 
     lines = [
         f"{result.task.name}: {result.status.value.replace('_', ' ')}",
         f"  loss     {result.loss_initial:.4g} -> {result.loss_final:.4g}",
-        f"  metric   {result.metric_name.replace('_', ' ')} {result.metric_value:.4g}",
+        f"  metric   {result.metric_name.replace('_', ' ')} {result.metric_initial:.4g} -> {result.metric_value:.4g}",
         f"  effort   {_finished(result)} stages, {result.gradient_evaluations} gradient evaluations, {result.seconds:.1f} s",
     ]
     if result.memory is not None and result.memory.peak is not None:

@@ -100,7 +100,7 @@ class Planner:
             if result.status is not Status.FINISHED:
                 break
             state = result.state
-        metric = evaluate_metric(self.task, scene_start.position[0], state.position[0], target, self.ot_solver)
+        metric = evaluate_metric(self.task, start=scene_start.position[0], final=state.position[0], target=target)
         finished = DeformResult(
             task=self.task,
             target=target,
@@ -109,7 +109,8 @@ class Planner:
             loss_initial=results[0].loss_before,
             loss_final=results[-1].loss,
             metric_name=self.task.metric,
-            metric_value=metric,
+            metric_initial=metric.initial,
+            metric_value=metric.final,
             gradient_evaluations=sum(result.gradient_evaluations for result in results),
             seconds=time.perf_counter() - start,
             names=self.names,
@@ -145,7 +146,7 @@ class Planner:
         state = state.to(device=self.simulator.device, dtype=self.simulator.dtype)
         if state.batch_size != 1:
             raise InputError("state", came=f"{state.batch_size} worlds", expected="a single world")
-        actions = torch.zeros(1, self.task.step_count, self.task.scene.action_size)
+        actions = torch.zeros(1, self.task.rollout_steps, self.task.scene.action_size)
         self.simulator.check_inputs(state, actions)
         return state
 
@@ -154,7 +155,7 @@ class Planner:
         seconds: dict[str, float] = {}
         clock = _Clock(seconds)
         self.objective.reset()
-        still = still_trajectory(state, self.task.step_count, self.task.scene.action_size)
+        still = still_trajectory(state, self.task.rollout_steps, self.task.scene.action_size)
         loss_before = float(self.objective.evaluate(still).loss[0])
         # "priorities f = optimal-transport potentials between current shape S_i and goal G"
         priorities = torch.full_like(state.position[0, :, 0], torch.nan)
@@ -214,17 +215,25 @@ class Planner:
         # All first actions are drawn at once, so that the result does not depend on how many worlds fit into a batch.
         shape = (len(placements), self.task.step_count, self.task.scene.action_size)
         first_actions = self.optimizer.initial_actions(shape, generator)
+        first_actions = torch.nn.functional.pad(first_actions, (0, 0, 0, self.task.rest_steps))
         found = []
         for start in range(0, len(placements), self.simulator.batch_size):
             part = placements[start : start + self.simulator.batch_size]
             worlds = state.fork(len(part)).with_manipulators(torch.stack([placement.pose for placement in part]))
             actions = first_actions[start : start + len(part)]
-            estimate = self.simulator.memory_estimate(self.task.step_count, worlds=len(part))
+            estimate = self.simulator.memory_estimate(self.task.rollout_steps, worlds=len(part))
             for observer in self.observers:
                 observer.optimization_started(index, len(part), estimate)
             self.objective.reset()
             found.append(
-                self.optimizer.minimize(self.simulator, worlds, actions, self.objective, on_iteration=self._notifier(index))
+                self.optimizer.minimize(
+                    self.simulator,
+                    worlds,
+                    actions,
+                    self.objective,
+                    rest_steps=self.task.rest_steps,
+                    on_iteration=self._notifier(index),
+                )
             )
         return found
 

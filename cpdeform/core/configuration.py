@@ -81,6 +81,7 @@ class RunConfiguration(FrozenModel):
         seed: Seed of first actions and random placements.
         stages: Number of stages; the task's own where absent.
         steps: Environment steps of a stage; the task's own where absent.
+        rest_steps: Environment steps of rest after them; the task's own where absent.
         target: File of the goal instead of the task's own, e.g. one written by `cpdeform task import-grid`.
         algorithm: ``"cpdeform"``, or ``"paper"`` for Algorithm 1 to the letter (`PAPER_SETTINGS`, `PAPER_PLACER_OPTIONS`).
         optimizer: Options of the optimiser.
@@ -100,6 +101,7 @@ class RunConfiguration(FrozenModel):
     seed: int = Field(default=0, ge=0)
     stages: int | None = Field(default=None, ge=1)
     steps: int | None = Field(default=None, ge=1)
+    rest_steps: int | None = Field(default=None, ge=0)
     target: Path | None = None
     algorithm: Literal["cpdeform", "paper"] = "cpdeform"
     optimizer: OptimizerConfiguration = OptimizerConfiguration()

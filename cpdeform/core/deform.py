@@ -200,7 +200,13 @@ def configured_task(configuration: RunConfiguration, *, registry: Registry) -> T
         InputError: The task or a change cannot be used.
     """
     task = load_task(configuration.task, registry=registry)
-    return changed_task(task, scene=configuration.scene, target=configuration.target, step_count=configuration.steps)
+    return changed_task(
+        task,
+        scene=configuration.scene,
+        target=configuration.target,
+        step_count=configuration.steps,
+        rest_steps=configuration.rest_steps,
+    )
 
 
 def make_objective(

@@ -111,6 +111,7 @@ class TrajectoryOptimizer:
         actions: Tensor,
         objective: Objective,
         *,
+        rest_steps: int = 0,
         on_iteration: Callable[[Iteration], None] | None = None,
     ) -> OptimizationResult:
         """Minimise the objective over the actions of each world.
@@ -120,6 +121,7 @@ class TrajectoryOptimizer:
             state: Start of B worlds.
             actions: First actions (B, T, A).
             objective: The loss; worlds do not influence each other.
+            rest_steps: The last steps of T, whose actions are left as they are.
             on_iteration: Called after each iteration.
 
         Returns:
@@ -141,6 +143,7 @@ class TrajectoryOptimizer:
             found, gradient, seconds = _evaluate(
                 simulator, _worlds(state, active), tried.detach()[active.to(tried.device)], objective, gauge
             )
+            gradient[:, gradient.shape[1] - rest_steps :] = 0.0
             evaluations += len(active)
             loss = torch.full_like(best_loss, torch.nan).index_copy(0, active, found)
             finite[active] &= torch.isfinite(found) & torch.isfinite(gradient).flatten(1).all(dim=1).cpu()

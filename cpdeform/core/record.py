@@ -113,7 +113,7 @@ class RunRecorder(Observer):
             }
             with replacing(self.directory / TARGET_FILE) as temporary, h5py.File(temporary, "w") as file:
                 write_dataset(file, "position", target, shape="particle, xyz", units="length (domain edge = 1)")
-                _write_target_grid(file, task)
+                _write_goal_extras(file, task)
             (self.directory / METRICS_FILE).write_text("", encoding="utf-8")
             self._write_run()
 
@@ -125,7 +125,7 @@ class RunRecorder(Observer):
 
     def _note_memory(self, use: MemoryUse) -> None:
         noted = self._run["memory"]
-        if noted is None or use.estimate >= noted["estimate_bytes"]:
+        if noted is None or (use.estimate, use.peak or 0) >= (noted["estimate_bytes"], noted["peak_bytes"] or 0):
             self._run["memory"] = {"worlds": use.worlds, "estimate_bytes": use.estimate, "peak_bytes": use.peak}
 
     def iteration_finished(self, stage: int, iteration: Iteration) -> None:
@@ -175,6 +175,7 @@ class RunRecorder(Observer):
             loss_initial=result.loss_initial,
             loss_final=result.loss_final,
             metric=result.metric_name,
+            metric_initial=result.metric_initial,
             metric_value=result.metric_value,
             gradient_evaluations=result.gradient_evaluations,
             seconds=result.seconds,
@@ -216,8 +217,10 @@ class RunRecorder(Observer):
             raise RecordError(f"cannot write the run record in {self.directory}: {error.strerror or error}.") from error
 
 
-def _write_target_grid(file: h5py.File, task: Task) -> None:
-    """Keep the goal's own node masses, if it has any, so that a run which goes on is judged by the same goal."""
+def _write_goal_extras(file: h5py.File, task: Task) -> None:
+    """Keep what else the goal's file says, so that a run which goes on is judged by the same goal."""
+    corresponds = torch.tensor(task.target_corresponds())
+    write_dataset(file, "corresponds", corresponds, shape="", units="whether the particles are the body's, one to one, moved")
     grid = task.load_target_grid()
     if grid is not None:
         cells = torch.nonzero(torch.as_tensor(grid))

@@ -97,6 +97,7 @@ class DeformResult:
         loss_initial: Loss before the first stage, objective units.
         loss_final: Loss after the last executed plan, objective units.
         metric_name: Name of the task's metric.
+        metric_initial: Its value at the scene's start, also for a run that goes on from a record.
         metric_value: Its value at the end.
         gradient_evaluations: Gradient evaluations of all stages and worlds.
         seconds: Wall time of the run.
@@ -111,6 +112,7 @@ class DeformResult:
     loss_initial: float
     loss_final: float
     metric_name: str
+    metric_initial: float
     metric_value: float
     gradient_evaluations: int
     seconds: float
@@ -126,7 +128,7 @@ class DeformResult:
     def memory(self) -> MemoryUse | None:
         """Memory of the rollouts and gradients of the largest batch; None where no iteration measured it."""
         uses = [iteration.memory for stage in self.stages for iteration in stage.history if iteration.memory is not None]
-        return max(uses, key=lambda use: use.estimate, default=None)
+        return max(uses, key=lambda use: (use.estimate, use.peak or 0), default=None)
 
     def save(self, directory: str | Path) -> Path:
         """Write the run record (configuration, metrics, states, actions) to a new directory and return its path.

@@ -113,7 +113,7 @@ def check_same_task(record: RunRecord, name: str, *, registry: Registry) -> None
         raise InputError("TASK", came=f'"{asked.name}"', expected=expected, remedy=remedy)
     asked = changed_task(asked, scene=recorded_configuration(record).scene)
     given, recorded = asked.model_dump(), record.task.model_dump()
-    different = [field for field in ("scene", "step_count", "metric") if given[field] != recorded[field]]
+    different = [field for field in ("scene", "step_count", "rest_steps", "metric") if given[field] != recorded[field]]
     goal = torch.as_tensor(asked.load_target()).to(record.target)
     if goal.shape != record.target.shape or not torch.allclose(goal, record.target, atol=1e-6):
         different.append("target")

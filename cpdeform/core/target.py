@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -17,6 +18,7 @@ from cpdeform.core.scene import Scene
 
 POSITION_SCALE = 2**16
 """Integer positions in a file are whole multiples of 1/POSITION_SCALE, length units."""
+
 
 def load_target(path: Path, *, scene: Scene) -> NDArray[np.float64]:
     """Read target particles from ``.npz`` or ``.h5`` with an array ``position`` (M, 3), or from ``.npy`` with such an array.
@@ -86,6 +88,48 @@ def load_target_grid(path: Path, *, scene: Scene) -> NDArray[np.float64] | None:
     grid = np.zeros((scene.grid_size,) * 3)
     grid[tuple(cells.astype(np.int64).T)] = masses
     return grid
+
+
+def load_correspondence(path: Path) -> bool:
+    """Whether a goal file says (array ``corresponds``, one truth value) that its particles are the body's, one to one, moved.
+
+    The goal then is within reach to the last particle: no distance is owed to another sampling of the same shape.
+
+    Args:
+        path: The file.
+
+    Raises:
+        InputError: The file is missing or unreadable.
+    """
+    with _arrays(path) as arrays:
+        return "corresponds" in arrays and bool(np.asarray(arrays["corresponds"]).all())
+
+
+def write_target(
+    path: Path, position: NDArray[Any], *, grid: NDArray[np.floating[Any]] | None = None, corresponds: bool = False
+) -> None:
+    """Write a goal file, an ``.npz`` whose bytes depend on its content alone (no time stamp).
+
+    Args:
+        path: The file; its directory must exist.
+        position: Goal particles (M, 3): integers in units of 2^-16 length units, or length units, which are rounded to that.
+        grid: Node masses (G, G, G) of the goal, mass units, where it was imported from them.
+        corresponds: Whether particle i is particle i of the body, moved; see `load_correspondence`.
+    """
+    if position.dtype.kind == "f":
+        position = np.rint(position * POSITION_SCALE)
+    arrays: dict[str, NDArray[Any]] = {"position": np.clip(position, 0, POSITION_SCALE - 1).astype(np.uint16)}
+    if grid is not None:
+        cells = np.argwhere(grid > 0.0)
+        arrays["grid_cells"] = cells.astype(np.uint8 if max(grid.shape) <= 256 else np.uint16)
+        arrays["grid_mass"] = grid[tuple(cells.T)].astype(np.float32)
+    if corresponds:
+        arrays["corresponds"] = np.array(True)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, values in arrays.items():
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, values, allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), buffer.getvalue(), zipfile.ZIP_DEFLATED, 9)
 
 
 @contextmanager

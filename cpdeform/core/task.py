@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field, ValidationError
 from cpdeform.core.errors import InputError, PluginError, UnknownNameError
 from cpdeform.core.plugins import Registry, load_registry
 from cpdeform.core.scene import FrozenModel, Scene
-from cpdeform.core.target import load_target, load_target_grid
+from cpdeform.core.target import load_correspondence, load_target, load_target_grid
 
 __all__ = [
     "Task",
@@ -40,7 +40,9 @@ class Task(FrozenModel):
         summary: One line for listings.
         scene: What is simulated.
         target: File of the target particles, see `load_target`.
-        step_count: Environment steps T of one stage.
+        step_count: Environment steps T of one stage in which the tools act.
+        rest_steps: Environment steps that follow, in which the tools hold still. The shape is judged when they are over: clay that
+            was pushed slides on, and a shape that is right only in passing is no result.
         stage_count: Number of stages that the task is meant for.
         metric: What the result is judged by.
         settings: What a run of this task sets where the user does not: fields of `cpdeform.core.configuration.RunConfiguration`.
@@ -51,9 +53,15 @@ class Task(FrozenModel):
     scene: Scene
     target: Path
     step_count: int = Field(default=10, ge=1)
+    rest_steps: int = Field(default=0, ge=0)
     stage_count: int = Field(default=1, ge=1)
     metric: Literal["incremental_iou", "wasserstein"] = "wasserstein"
     settings: dict[str, Any] = Field(default_factory=dict)
+
+    @property
+    def rollout_steps(self) -> int:
+        """Environment steps of one stage, action and rest together."""
+        return self.step_count + self.rest_steps
 
     def load_target(self) -> NDArray[np.float64]:
         """Read the goal particles.
@@ -76,6 +84,14 @@ class Task(FrozenModel):
             InputError: The file is missing or unreadable, or the masses do not fit the scene's grid.
         """
         return load_target_grid(self.target, scene=self.scene)
+
+    def target_corresponds(self) -> bool:
+        """Whether the goal's file says that its particles are the body's, one to one, moved, and their number does not deny it.
+
+        Raises:
+            InputError: The file is missing or unreadable.
+        """
+        return load_correspondence(self.target) and len(self.load_target()) == self.scene.particle_count
 
 
 def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -213,7 +229,12 @@ def read_task(path: Path, *, variant: str | None = None) -> Task:
 
 
 def changed_task(
-    task: Task, *, scene: Mapping[str, Any] | None = None, target: Path | None = None, step_count: int | None = None
+    task: Task,
+    *,
+    scene: Mapping[str, Any] | None = None,
+    target: Path | None = None,
+    step_count: int | None = None,
+    rest_steps: int | None = None,
 ) -> Task:
     """The task with changes.
 
@@ -222,11 +243,12 @@ def changed_task(
         scene: Changes of its scene, nested as `merge` takes them.
         target: Another file of its goal.
         step_count: Another number of environment steps of a stage.
+        rest_steps: Another number of steps of rest after them.
 
     Raises:
         InputError: A change does not fit.
     """
-    changes = {"scene": scene or None, "target": target, "step_count": step_count}
+    changes = {"scene": scene or None, "target": target, "step_count": step_count, "rest_steps": rest_steps}
     changes = {field: change for field, change in changes.items() if change is not None}
     if not changes:
         return task

@@ -52,6 +52,16 @@ def test_reaches_the_optimum(simulator, state):
     assert (best.diff(dim=0) <= 0).all()
 
 
+def test_rest_stays_as_it_is_and_counts(simulator, state):
+    first = zeros()
+    first[:, 3:] = 0.25
+    optimizer = TrajectoryOptimizer(iterations=120, learning_rate=0.02, patience=120, schedule="paper")
+    result = optimizer.minimize(simulator, state, first, Distance(goal(state, [0.02, 0.02, 0.02])), rest_steps=2)
+    assert torch.equal(result.actions[:, 3:], first[:, 3:].double())
+    # the plan of the first three steps makes up for what the last two do
+    torch.testing.assert_close(result.actions.sum(dim=1) * 0.02, torch.full((3, 3), 0.02).double(), atol=1e-4, rtol=0)
+
+
 def test_actions_are_clipped(simulator, state):
     result = TrajectoryOptimizer(iterations=60).minimize(simulator, state, zeros(), Distance(goal(state, [0.4, 0.0, 0.0])))
     assert float(result.actions.max()) == 1.0

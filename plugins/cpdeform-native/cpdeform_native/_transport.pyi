@@ -33,4 +33,8 @@ class Solver:
         warm_tolerance: float,
         warm_iterations: int,
         same_target: bool,
-    ) -> tuple[int, float]: ...
+        source_order: NDArray[np.int32],
+        target_order: NDArray[np.int32],
+        source_extent: float,
+        target_extent: float,
+    ) -> tuple[int, float, float, float]: ...

@@ -25,6 +25,41 @@ except ImportError as error:
 _ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 
 
+@dataclasses.dataclass(frozen=True)
+class Order:
+    """The order of a cloud in which neighbours in memory are neighbours in space.
+
+    Attributes:
+        numbers: The points' numbers (N,), int32, on the CPU.
+        extent: Size of blocks of neighbours when the points were sorted, length units; 0 where they never were.
+    """
+
+    numbers: Tensor
+    extent: float
+
+    @classmethod
+    def room(cls, count: int) -> Order:
+        """Room for the order of `count` points, not sorted yet."""
+        return cls(torch.empty(count, dtype=torch.int32), 0.0)
+
+    def copy(self) -> Order:
+        """An order that may be changed without changing this one."""
+        return Order(self.numbers.clone(), self.extent)
+
+
+@dataclasses.dataclass(frozen=True)
+class OrderedPotentials(Potentials):
+    """What a warm call starts from.
+
+    Attributes:
+        source_order: Order of the source, which spares sorting it again; None where unknown.
+        target_order: That of the target.
+    """
+
+    source_order: Order | None = None
+    target_order: Order | None = None
+
+
 class OTSolverNative(OTSolver):
     """Debiased Sinkhorn divergence in C++ for the CPU, for the cost c(x, y) = |x - y|^p and the temperature eps = blur^p.
 
@@ -50,7 +85,8 @@ class OTSolverNative(OTSolver):
         tolerance: L1 error of the source marginal at which a solution counts as converged.
         iterations: Most iterations at one temperature.
         warm_iterations: Most iterations of a warm call.
-        warm_tolerance: L1 error of the source marginal at which a warm call stops iterating.
+        warm_tolerance: L1 error of the source marginal at which a warm call stops iterating, as an iteration without
+            over-relaxation would show it.
         threads: Threads; those the process may use where absent.
         instruction_set: ``"baseline"``, ``"avx2"`` or ``"avx512"``; the fastest that the processor has where absent.
 
@@ -83,7 +119,7 @@ class OTSolverNative(OTSolver):
         tolerance: float = 1e-4,
         iterations: int = 3000,
         warm_iterations: int = 20,
-        warm_tolerance: float = 1.5e-2,
+        warm_tolerance: float = 7.5e-3,
         threads: int | None = None,
         instruction_set: str | None = None,
     ) -> None:
@@ -128,8 +164,9 @@ class OTSolverNative(OTSolver):
 
         With `previous`, a call makes up to `warm_iterations` iterations, the source potential first: it is the one whose points
         moved, and the target's potential, a function on unmoved points, predicts it. What they leave accumulates slowly over
-        many calls, so start cold again from time to time. `converged` still speaks of `tolerance`. A solution for tensors of
-        another device is computed on the CPU and moved there.
+        many calls, so start cold again from time to time. Pairs below 1e-3 of a point's mass are left out, less than the
+        iterations leave. The order of the points is kept until they have moved too far for it. `converged` still speaks of
+        `tolerance`. A solution for tensors of another device is computed on the CPU and moved there.
         """
         problem = Problem.of(source, target, source_weights, target_weights, self.blur, self.exponent)
         if source.dtype not in _ROUNDING:
@@ -139,7 +176,6 @@ class OTSolverNative(OTSolver):
 
     def _solve(self, problem: Problem, state: Potentials | None) -> OTResult:
         source, target = problem.source, problem.target
-        dtype, device = source.points.dtype, source.points.device
         work = self._precision(problem)
 
         def array(values: Tensor | None, like: Tensor) -> Tensor:
@@ -160,7 +196,8 @@ class OTSolverNative(OTSolver):
         )
         gradient = torch.empty(source.points.shape, dtype=work)
         inputs = (source.points, target.points, source.weights, target.weights)
-        count, error = self._engine.solve(
+        orders = self._orders(problem, state)
+        count, error, *extents = self._engine.solve(
             *(np.ascontiguousarray(values.to(device="cpu", dtype=work).numpy()) for values in inputs),
             *(values.numpy() for values in (f, g, source_self, target_self, gradient)),
             exponent=self.exponent,
@@ -173,8 +210,24 @@ class OTSolverNative(OTSolver):
             warm_tolerance=self.warm_tolerance,
             warm_iterations=self.warm_iterations,
             same_target=state is not None and state.target_side.same_as(target),
+            source_order=orders[0].numbers.numpy(),
+            target_order=orders[1].numbers.numpy(),
+            source_extent=orders[0].extent,
+            target_extent=orders[1].extent,
         )
-        return self._result(problem, (f, g, source_self, target_self), gradient, int(count), float(error), dtype, device)
+        orders = (dataclasses.replace(orders[0], extent=extents[0]), dataclasses.replace(orders[1], extent=extents[1]))
+        return self._result(problem, (f, g, source_self, target_self), orders, gradient, int(count), float(error))
+
+    @staticmethod
+    def _orders(problem: Problem, state: Potentials | None) -> tuple[Order, Order]:
+        """The clouds' orders to start from, which the solution may change, or room for them."""
+        known = (state.source_order, state.target_order) if isinstance(state, OrderedPotentials) else (None, None)
+        sides = (problem.source, problem.target)
+        first, second = (
+            order.copy() if order is not None else Order.room(side.points.shape[0])
+            for order, side in zip(known, sides, strict=True)
+        )
+        return first, second
 
     def _precision(self, problem: Problem) -> torch.dtype:
         """The type to compute in: the input's, or double where single rounding would hide the tolerance."""
@@ -186,20 +239,22 @@ class OTSolverNative(OTSolver):
         self,
         problem: Problem,
         solution: tuple[Tensor, Tensor, Tensor, Tensor],
+        orders: tuple[Order, Order],
         gradient: Tensor,
         count: int,
         error: float,
-        dtype: torch.dtype,
-        device: torch.device,
     ) -> OTResult:
         """Debias, fix the gauge and sum up, in double precision."""
+        dtype, device = problem.source.points.dtype, problem.source.points.device
         f, g, source_self, target_self = (values.double() for values in solution)
         weights, other_weights = (side.weights.to(device="cpu", dtype=torch.float64) for side in (problem.source, problem.target))
         potential, other = (f - source_self, g - target_self) if self.debias else (f, g)
         potential, other = fix_gauge(potential, other, weights)
         value = (weights * potential).sum() + (other_weights * other).sum()
         raw = [values.to(device=device, dtype=dtype) for values in solution]
-        state = Potentials(raw[0], raw[1], raw[2] if self.debias else None, raw[3] if self.debias else None, problem.target)
+        state = OrderedPotentials(
+            raw[0], raw[1], raw[2] if self.debias else None, raw[3] if self.debias else None, problem.target, *orders
+        )
         return OTResult(
             value=value.to(device=device, dtype=dtype),
             source_potential=potential.to(device=device, dtype=dtype),

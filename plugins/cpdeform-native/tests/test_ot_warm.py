@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import threading
 
 import pytest
@@ -11,8 +13,9 @@ from torch import Tensor
 from cpdeform.core.errors import InputError
 from cpdeform.core.ot import OTResult
 from cpdeform.core.testing.ot_bench import cloud, cosine, pressed
+from cpdeform.ot.divergence import Potentials, Problem
 from cpdeform_native import _transport
-from cpdeform_native.ot import OTSolverNative
+from cpdeform_native.ot import OrderedPotentials, OTSolverNative
 
 STEP = 1e-3
 """RMS motion of the points between two calls, length units."""
@@ -114,6 +117,118 @@ def test_another_blur_starts_cold_and_other_sizes_are_refused() -> None:
     assert torch.equal(fine.solve(source, target, previous=coarse).source_gradient, fine.solve(source, target).source_gradient)
     with pytest.raises(InputError, match="previous"):
         fine.solve(source[:-1], target, previous=coarse)
+
+
+# Orders and lists ---------------------------------------------------------------------------------------------------------
+
+
+def state_of(result: OTResult) -> OrderedPotentials:
+    assert isinstance(result.warm_state, OrderedPotentials)
+    return result.warm_state
+
+
+def orders_of(result: OTResult) -> tuple[Tensor, Tensor]:
+    state = state_of(result)
+    assert state.source_order is not None
+    assert state.target_order is not None
+    return state.source_order.numbers, state.target_order.numbers
+
+
+def without_orders(result: OTResult) -> OTResult:
+    """The same result with a state that knows the potentials alone."""
+    state = state_of(result)
+    fields = {field.name: getattr(state, field.name) for field in dataclasses.fields(Potentials)}
+    return dataclasses.replace(result, warm_state=Potentials(**fields))
+
+
+def scattered(points: Tensor, distance: float) -> Tensor:
+    """Points (N, 3) moved at random by `distance` in the root mean square, length units."""
+    noise = torch.randn(points.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    return points + (noise * (distance / 3**0.5)).to(points)
+
+
+def same_to_tolerance(first: OTResult, second: OTResult) -> bool:
+    near = float(first.value) == pytest.approx(float(second.value), rel=1e-3)
+    return bool(near) and cosine(first.source_gradient, second.source_gradient) > 0.9995
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_kept_order_gives_what_a_fresh_one_gives(dtype: torch.dtype) -> None:
+    source, target = cloud(1500, seed=25).to(dtype), (cloud(1100, seed=26) + 0.02).to(dtype)
+    solver = OTSolverNative(blur=2e-3)
+    start = solver.solve(source, target)
+    source = scattered(source, STEP)
+    kept, fresh = solver.solve(source, target, previous=start), solver.solve(source, target, previous=without_orders(start))
+    assert all(torch.equal(first, second) for first, second in zip(orders_of(start), orders_of(kept), strict=True))
+    assert not torch.equal(orders_of(fresh)[0], orders_of(start)[0])
+    assert torch.equal(orders_of(fresh)[0].sort().values, torch.arange(1500, dtype=torch.int32))
+    assert kept.iterations == fresh.iterations
+    assert same_to_tolerance(kept, fresh)
+
+
+def test_points_that_move_far_are_sorted_again() -> None:
+    source, target = cloud(1500, seed=25).float(), cloud(1100, seed=26).float() + 0.02
+    solver = OTSolverNative(blur=5e-3, warm_iterations=3000, warm_tolerance=1e-5)
+    start = solver.solve(source, target)
+    before = [numbers.clone() for numbers in orders_of(start)]
+    shuffled = source.roll(700, dims=0)
+    warm, fresh = solver.solve(shuffled, target, previous=start), solver.solve(shuffled, target, previous=without_orders(start))
+    assert torch.equal(orders_of(warm)[0], orders_of(fresh)[0])
+    assert torch.equal(orders_of(warm)[1], before[1])
+    assert all(torch.equal(first, second) for first, second in zip(orders_of(start), before, strict=True))
+    cold = solver.solve(shuffled, target)
+    assert same_to_tolerance(warm, fresh)
+    assert same_to_tolerance(warm, cold)
+
+
+def test_an_order_wears_out_step_by_step() -> None:
+    """Every step is small, yet the blocks must not grow without end."""
+    source, target = cloud(1000, seed=25).float(), cloud(1000, seed=26).float() + 0.02
+    solver = OTSolverNative(blur=5e-3)
+    result = start = solver.solve(source, target)
+    generator = torch.Generator().manual_seed(3)
+    for _ in range(12):
+        source = source + torch.randn(source.shape, generator=generator) * 3e-3
+        result = solver.solve(source, target, previous=result)
+    assert not torch.equal(orders_of(result)[0], orders_of(start)[0])
+    assert torch.equal(orders_of(result)[1], orders_of(start)[1])
+    assert cosine(result.source_gradient, solver.solve(source, target).source_gradient) > 0.98
+
+
+@pytest.mark.parametrize("distance", [STEP, 10 * STEP, 100 * STEP])
+@pytest.mark.parametrize("blur", [1e-3, 5e-3])
+def test_warm_soft_minima_are_those_of_all_pairs(distance: float, blur: float) -> None:
+    """However far the points moved, no list hides a pair that matters: the source potential against all pairs."""
+    source, target = cloud(900, seed=4), cloud(700, seed=5)
+    solver = OTSolverNative(blur=blur, debias=False)
+    source, start = scattered(source, distance), solver.solve(source, target)
+    state = state_of(solver.solve(source, target, previous=start))
+    problem = Problem.of(source, target, None, None, blur, 1)
+    updated = problem.source_update(state.target)
+    assert float((updated - state.source).abs().max()) < 0.05 * problem.epsilon
+
+
+def test_a_saved_state_serves_as_well() -> None:
+    source, target = cloud(300, seed=25).float(), cloud(300, seed=26).float() + 0.02
+    solver = OTSolverNative(blur=2e-3)
+    start = solver.solve(source, target)
+    file = io.BytesIO()
+    torch.save(start, file)
+    file.seek(0)
+    loaded = torch.load(file, weights_only=False)
+    source = scattered(source, STEP)
+    first, second = solver.solve(source, target, previous=start), solver.solve(source, target, previous=loaded)
+    assert torch.equal(first.source_gradient, second.source_gradient)
+    assert torch.equal(solver.solve(source, target, previous=None).value, solver.solve(source, target).value)
+
+
+def test_an_order_with_strange_numbers_is_refused() -> None:
+    source, target = cloud(60, seed=25), cloud(50, seed=26)
+    solver = OTSolverNative(blur=5e-3)
+    start = solver.solve(source, target)
+    orders_of(start)[0][7] = 60
+    with pytest.raises(ValueError, match="order"):
+        solver.solve(source, target, previous=start)
 
 
 # Threads and instruction sets ---------------------------------------------------------------------------------------------

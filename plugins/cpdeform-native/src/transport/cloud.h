@@ -10,11 +10,21 @@ namespace cpdeform::transport {
 
 // Points sorted into compact blocks of `block_size`, coordinate by coordinate. The last block is filled up with copies of the last
 // point; `weight` of such padding is zero.
+// An order (count,) of the caller's points, and the blocks' size in it when it was made: mean sum of a box's sides, length units.
+struct Order {
+  int32_t* numbers;
+  double extent;  // 0 where there is no order yet
+};
+
 template <class Real>
 class Cloud {
  public:
   // `points` (count, 3) row by row and non-negative `weights` (count,), which are made to sum to one.
   Cloud(const Real* points, const Real* weights, int count);
+
+  // The same in the order of an earlier cloud, as long as the points have not moved so far that its blocks have become loose, and
+  // otherwise sorted again; `order` receives what is used.
+  Cloud(const Real* points, const Real* weights, int count, Order& order);
 
   int count() const { return count_; }
   int padded() const { return static_cast<int>(order_.size()); }
@@ -39,6 +49,10 @@ class Cloud {
     int32_t number;
   };
   static void split(Point* first, Point* last);
+  void sort(const Real* points);
+  void place(const Real* points);
+  void weigh(const Real* weights);
+  double extent() const;
 
   int count_;
   std::vector<int32_t> order_;

@@ -18,6 +18,13 @@ struct Potentials {
 // Temperature at which potentials are in units of the cost: 1 / log 2.
 constexpr double natural_temperature = 1.4426950408889634;
 
+// When a descent ends, and how boldly it goes.
+struct Descent {
+  double tolerance;  // L1 error of the source's marginal
+  int least, limit;  // iterations
+  bool near;         // the start is a solution of a nearby problem
+};
+
 template <class Real>
 class Coupling {
  public:
@@ -31,10 +38,10 @@ class Coupling {
   double epsilon() const { return epsilon_; }
 
   // Over-relaxed Sinkhorn iterations (Thibault et al., "Overrelaxed Sinkhorn-Knopp Algorithm for Regularized Optimal Transport",
-  // Algorithms 2021), the source's potential first, until the L1 error of the source's marginal is below `tolerance`. The
-  // relaxation follows the observed rate of convergence. Afterwards the target's potential is the soft minimum of the source's.
-  // Returns the iterations used; at least `least` are made.
-  int descend(double tolerance, int least, int limit);
+  // Algorithms 2021), the source's potential first, until the L1 error of the source's marginal is small. The relaxation
+  // follows the observed rate of convergence. Afterwards the target's potential is the soft minimum of the source's. Returns the
+  // iterations used.
+  int descend(const Descent& descent);
 
   // Averaged iterations t <- (t + softmin(t)) / 2 on the potential of a cloud with itself, which converge fast.
   void descend_self(bool of_source, double tolerance, int limit);

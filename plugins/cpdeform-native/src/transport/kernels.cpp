@@ -47,6 +47,13 @@ CPDEFORM_INLINE Vec<Real> cost_of(Vec<Real> square) {
   return square_root(square);
 }
 
+// shift - scale * cost
+template <int Exponent, class Real>
+CPDEFORM_INLINE Vec<Real> exponent_of(Vec<Real> shift, Vec<Real> square, Real scale) {
+  if constexpr (Exponent == 2) return shift - scale * square;
+  return minus_scaled_root(shift, square, scale);
+}
+
 template <int Exponent, class Real>
 int candidates(const Columns<Real>& columns, const Rows<Real>& rows, Real scale, Real cut, int32_t* list) {
   constexpr int lanes = Simd<Real>::lanes;
@@ -86,48 +93,61 @@ int candidates(const Columns<Real>& columns, const Rows<Real>& rows, Real scale,
   return count;
 }
 
-template <int Exponent, bool Gradient, bool Collect, class Real>
-int evaluate(const Columns<Real>& columns, const Rows<Real>& rows, Real scale, const int32_t* list, int count, Real cut,
-             int32_t* kept) {
+// Most candidates fail: an exponential of each would cost more than going through the list twice.
+template <int Exponent, class Real>
+int select(const Columns<Real>& columns, const Rows<Real>& rows, Real scale, Real cut, int32_t* list, int count) {
+  constexpr int vectors = Block<Real>::vectors;
+  const Block<Real> x = load_block(rows.axis[0]), y = load_block(rows.axis[1]), z = load_block(rows.axis[2]);
+  Block<Real> t = load_block(rows.t);
+  for (int k = 0; k < vectors; ++k) t.v[k] += cut;
+  int found = 0;
+  for (int n = 0; n < count; ++n) {
+    const int32_t j = list[n];
+    const Real* column = columns.packed + 4 * static_cast<int64_t>(j);
+    Mask<Real> large{};
+    for (int k = 0; k < vectors; ++k) {
+      const Vec<Real> dx = x.v[k] - column[0], dy = y.v[k] - column[1], dz = z.v[k] - column[2];
+      const Vec<Real> square = dx * dx + (dy * dy + (dz * dz + static_cast<Real>(Exponent == 1 ? 1e-30 : 0)));
+      large |= exponent_of<Exponent, Real>(t.v[k] + column[3], square, scale) > Vec<Real>{};
+    }
+    list[found] = j;
+    found += any<Real>(large);
+  }
+  return found;
+}
+
+template <int Exponent, bool Gradient, class Real>
+void evaluate(const Columns<Real>& columns, const Rows<Real>& rows, Real scale, const int32_t* list, int count) {
   constexpr int vectors = Block<Real>::vectors;
   const Block<Real> x = load_block(rows.axis[0]), y = load_block(rows.axis[1]), z = load_block(rows.axis[2]);
   const Block<Real> t = load_block(rows.t);
   Block<Real> total{}, slope[3]{};
-  int found = 0;
   for (int first = 0; first < count; first += chunk_size) {
     const int last = first + chunk_size < count ? first + chunk_size : count;
     Block<Real> sum{};
     for (int n = first; n < last; ++n) {
       const int32_t j = list[n];
       const Real* column = columns.packed + 4 * static_cast<int64_t>(j);
-      Mask<Real> large{};
       for (int k = 0; k < vectors; ++k) {
         const Vec<Real> dx = x.v[k] - column[0], dy = y.v[k] - column[1], dz = z.v[k] - column[2];
         // a pair at distance zero has no gradient; its symmetric subgradient is zero
         const Vec<Real> square = dx * dx + (dy * dy + (dz * dz + static_cast<Real>(Exponent == 1 ? 1e-30 : 0)));
         const Vec<Real> shift = t.v[k] + column[3];
         Vec<Real> inverse, exponent;
-        if constexpr (Exponent == 2) {
-          exponent = shift - scale * square;
-        } else if constexpr (Gradient) {
+        if constexpr (Exponent == 1 && Gradient) {
           inverse = inverse_square_root(square);
           exponent = shift - scale * (square * inverse);
         } else {
-          exponent = minus_scaled_root(shift, square, scale);
+          exponent = exponent_of<Exponent, Real>(shift, square, scale);
         }
         const Vec<Real> term = exponential_of_two(exponent);
         sum.v[k] += term;
-        if constexpr (Collect) large |= exponent > -cut;
         if constexpr (Gradient) {
           const Vec<Real> weight = Exponent == 1 ? term * inverse : term * 2;
           slope[0].v[k] += weight * dx;
           slope[1].v[k] += weight * dy;
           slope[2].v[k] += weight * dz;
         }
-      }
-      if constexpr (Collect) {
-        kept[found] = j;
-        found += any<Real>(large);
       }
     }
     for (int k = 0; k < vectors; ++k) total.v[k] += sum.v[k];
@@ -144,7 +164,6 @@ int evaluate(const Columns<Real>& columns, const Rows<Real>& rows, Real scale, c
   if constexpr (Gradient) {
     for (int axis = 0; axis < 3; ++axis) store_block(rows.gradient[axis], slope[axis]);
   }
-  return found;
 }
 
 template <int Exponent, class Real>
@@ -171,23 +190,18 @@ int any_candidates(const Columns<Real>& columns, const Rows<Real>& rows, int exp
 }
 
 template <class Real>
-int any_evaluate(const Columns<Real>& columns, const Rows<Real>& rows, int exponent, Real scale, const int32_t* list, int count,
-                 Real cut, int32_t* kept) {
-  if (kept != nullptr) {
-    return exponent == 1 ? evaluate<1, false, true>(columns, rows, scale, list, count, cut, kept)
-                         : evaluate<2, false, true>(columns, rows, scale, list, count, cut, kept);
-  }
-  return exponent == 1 ? evaluate<1, false, false>(columns, rows, scale, list, count, cut, kept)
-                       : evaluate<2, false, false>(columns, rows, scale, list, count, cut, kept);
+int any_select(const Columns<Real>& columns, const Rows<Real>& rows, int exponent, Real scale, Real cut, int32_t* list, int count) {
+  return exponent == 1 ? select<1>(columns, rows, scale, cut, list, count) : select<2>(columns, rows, scale, cut, list, count);
+}
+
+template <class Real>
+void any_evaluate(const Columns<Real>& columns, const Rows<Real>& rows, int exponent, Real scale, const int32_t* list, int count) {
+  exponent == 1 ? evaluate<1, false>(columns, rows, scale, list, count) : evaluate<2, false>(columns, rows, scale, list, count);
 }
 
 template <class Real>
 void any_gradient(const Columns<Real>& columns, const Rows<Real>& rows, int exponent, Real scale, const int32_t* list, int count) {
-  if (exponent == 1) {
-    evaluate<1, true, false>(columns, rows, scale, list, count, Real{}, nullptr);
-  } else {
-    evaluate<2, true, false>(columns, rows, scale, list, count, Real{}, nullptr);
-  }
+  exponent == 1 ? evaluate<1, true>(columns, rows, scale, list, count) : evaluate<2, true>(columns, rows, scale, list, count);
 }
 
 template <class Real>
@@ -196,8 +210,8 @@ void any_largest(const Columns<Real>& columns, const Rows<Real>& rows, int expon
 }
 
 template <class Real>
-constexpr cpdeform::transport::Kernels<Real> kernels = {any_candidates<Real>, any_evaluate<Real>, any_gradient<Real>,
-                                                        any_largest<Real>};
+constexpr cpdeform::transport::Kernels<Real> kernels = {any_candidates<Real>, any_select<Real>, any_evaluate<Real>,
+                                                        any_gradient<Real>, any_largest<Real>};
 
 }  // namespace
 

@@ -47,10 +47,11 @@ struct Kernels {
   // all columns and a register more. Returns their number.
   int (*candidates)(const Columns<Real>& columns, const Rows<Real>& rows, int exponent, Real scale, Real cut, int32_t* list);
 
-  // Soft minimum over the listed columns. With `kept`, which may be `list` itself, also those j with e_ij > -cut for some i, their
-  // number returned.
-  int (*evaluate)(const Columns<Real>& columns, const Rows<Real>& rows, int exponent, Real scale, const int32_t* list, int count,
-                  Real cut, int32_t* kept);
+  // Of the listed columns those with e_ij > -cut for some i, and no others: into `list` again. Returns their number.
+  int (*select)(const Columns<Real>& columns, const Rows<Real>& rows, int exponent, Real scale, Real cut, int32_t* list, int count);
+
+  // Soft minimum over the listed columns.
+  void (*evaluate)(const Columns<Real>& columns, const Rows<Real>& rows, int exponent, Real scale, const int32_t* list, int count);
 
   // The same, and the gradient.
   void (*evaluate_gradient)(const Columns<Real>& columns, const Rows<Real>& rows, int exponent, Real scale, const int32_t* list,

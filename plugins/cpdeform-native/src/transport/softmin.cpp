@@ -13,6 +13,24 @@ namespace {
 constexpr int slack = 3;
 // Sums so far from one that terms may have been clamped.
 constexpr int far_off = 100;
+// No list.
+constexpr int none = -1;
+// Passes that made lists, before all are forgotten: what each list was made for has to be compared with the present.
+constexpr size_t most_snapshots = 6;
+
+// Largest of now[i] - before[i], for a whole number of blocks. Sixteen maxima at once, which compilers turn into registers.
+template <class Real>
+Real growth(const Real* now, const Real* before, int count) {
+  Real most[block_size];
+  std::fill_n(most, block_size, -std::numeric_limits<Real>::infinity());
+  for (int first = 0; first < count; first += block_size) {
+    for (int i = 0; i < block_size; ++i) {
+      const Real change = now[first + i] - before[first + i];
+      most[i] = most[i] < change ? change : most[i];
+    }
+  }
+  return *std::max_element(most, most + block_size);
+}
 
 }  // namespace
 
@@ -29,7 +47,10 @@ SoftMinimum<Real>::SoftMinimum(Team& team, const Kernels<Real>& kernels, const C
       packed_(4 * static_cast<size_t>(columns.padded())),
       log2_sum_(rows.padded()),
       scratch_(team.size()),
-      lists_(rows.blocks()) {
+      lists_(rows.blocks()),
+      snapshot_(rows.blocks(), none),
+      listed_t_(rows.padded()),
+      reach_(rows.blocks()) {
   for (int axis = 0; axis < 3; ++axis) {
     for (int j = 0; j < columns.padded(); ++j) packed_[4 * static_cast<size_t>(j) + axis] = columns.axis(axis)[j];
     view_.axis[axis] = columns.axis(axis);
@@ -45,14 +66,14 @@ SoftMinimum<Real>::SoftMinimum(Team& team, const Kernels<Real>& kernels, const C
 template <class Real>
 void SoftMinimum<Real>::set_temperature(double epsilon) {
   scale_ = static_cast<Real>(1.0 / (epsilon * 0.69314718055994530942));
-  listed_ = false;
+  forget();
 }
 
 template <class Real>
 void SoftMinimum<Real>::set_cut(int cut, int margin) {
   cut_ = static_cast<Real>(cut);
   margin_ = static_cast<Real>(margin);
-  listed_ = false;
+  forget();
 }
 
 template <class Real>
@@ -120,77 +141,88 @@ const std::vector<Real>& SoftMinimum<Real>::update(const std::vector<Real>& othe
 }
 
 template <class Real>
+void SoftMinimum<Real>::forget() {
+  std::fill(snapshot_.begin(), snapshot_.end(), none);
+  listed_h_.clear();
+}
+
+// Find out how far each list still reaches, and drop those that may miss pairs which matter.
+template <class Real>
+void SoftMinimum<Real>::check_lists(const std::vector<Real>& t) {
+  std::vector<Real> column_growth;
+  for (const std::vector<Real>& before : listed_h_) column_growth.push_back(growth(h_.data(), before.data(), columns_.padded()));
+  for (int number = 0; number < rows_.blocks(); ++number) {
+    if (snapshot_[number] == none) continue;
+    const int first = number * block_size;
+    const Real grown = column_growth[snapshot_[number]] + growth(t.data() + first, listed_t_.data() + first, block_size);
+    reach_[number] = cut_ + margin_ - grown;
+    if (!(grown <= margin_)) snapshot_[number] = none;
+  }
+}
+
+template <class Real>
 const std::vector<Real>& SoftMinimum<Real>::pass(std::vector<Real>& t, std::vector<Real> (*gradient)[3], bool keep_lists) {
-  // how much the exponent of a pair outside the lists may have grown through its column
-  Real growth = 0;
-  if (listed_) {
-    growth = -std::numeric_limits<Real>::infinity();
-    for (int j = 0; j < columns_.padded(); ++j) growth = std::max(growth, h_[j] - listed_h_[j]);
-    for (int i = 0; i < rows_.padded() && listed_; ++i) listed_ = growth + t[i] - listed_t_[i] <= margin_;
+  check_lists(t);
+  int present = none;
+  if (keep_lists && std::find(snapshot_.begin(), snapshot_.end(), none) != snapshot_.end()) {
+    if (listed_h_.size() == most_snapshots) forget();
+    present = static_cast<int>(listed_h_.size());
+    listed_h_.push_back(h_);
   }
-  const bool reuse = listed_, make = keep_lists && !listed_;
-  if (make) {
-    listed_t_ = t;
-    listed_h_ = h_;
-    listed_ = true;
-  }
-  std::atomic<bool> stale{false};
   std::atomic<int64_t> pairs{0};
   for_blocks([&](int number, int thread) {
     const int first = number * block_size;
-    std::vector<int32_t>& scratch = scratch_[thread];
-    scratch.resize(columns_.padded() + block_size);
     Real guess[block_size];
     std::copy_n(t.data() + first, block_size, guess);
     Rows<Real> rows = block(number, guess);
     rows.log2_sum = log2_sum_.data() + first;
     for (int axis = 0; axis < 3 && gradient != nullptr; ++axis) rows.gradient[axis] = (*gradient)[axis].data() + first;
-
-    std::vector<int32_t>& list = lists_[number];
-    int64_t evaluated = 0;
-    for (int attempt = 0;; ++attempt) {
-      // exponents below -reach may be missing
-      Real reach;
-      const int32_t* columns;
-      int count;
-      if (reuse && attempt == 0) {
-        Real row_growth = -std::numeric_limits<Real>::infinity();
-        for (int i = 0; i < block_size; ++i) row_growth = std::max(row_growth, guess[i] - listed_t_[first + i]);
-        reach = cut_ + margin_ - (growth + row_growth);
-        columns = list.data();
-        count = static_cast<int>(list.size());
-      } else {
-        reach = cut_ + (make && attempt == 0 ? margin_ : slack);
-        count = kernels_.candidates(view_, rows, exponent_, scale_, reach, scratch.data());
-        columns = scratch.data();
-      }
-      evaluated += count;
-      int kept = 0;
-      const bool collect = make && attempt == 0;
-      if (gradient != nullptr) {
-        kernels_.evaluate_gradient(view_, rows, exponent_, scale_, columns, count);
-      } else {
-        kept = kernels_.evaluate(view_, rows, exponent_, scale_, columns, count, reach, collect ? scratch.data() : nullptr);
-      }
-      if (collect) list.assign(scratch.data(), scratch.data() + kept);
-
-      const auto [lowest, highest] = std::minmax_element(rows.log2_sum, rows.log2_sum + block_size);
-      if (*lowest >= cut_ - reach && *highest < far_off) break;
-      stale = true;
-      if (*lowest < -far_off || *highest >= far_off) kernels_.largest(view_, rows, exponent_, scale_);
-      for (int i = 0; i < block_size; ++i) guess[i] -= rows.log2_sum[i];
-      rows.t_largest = *std::max_element(guess, guess + block_size);
-    }
+    const int evaluated = solve_block(rows, guess, number, scratch_[thread], gradient != nullptr, present);
     for (int i = 0; i < block_size; ++i) {
       const Real updated = guess[i] - rows.log2_sum[i];
       rows.log2_sum[i] = t[first + i] - updated;
       t[first + i] = updated;
     }
-    pairs.fetch_add(evaluated * block_size, std::memory_order_relaxed);
+    pairs.fetch_add(static_cast<int64_t>(evaluated) * block_size, std::memory_order_relaxed);
   });
-  if (stale) listed_ = false;
   pairs_ += pairs;
   return log2_sum_;
+}
+
+// The soft minima of one block, for `guess`, which is improved where it is too far off to tell. A new list is kept where `present`
+// is a snapshot of the columns' potentials. Returns the columns evaluated.
+template <class Real>
+int SoftMinimum<Real>::solve_block(Rows<Real>& rows, Real* guess, int number, std::vector<int32_t>& scratch, bool with_gradient,
+                                   int present) {
+  std::vector<int32_t>& list = lists_[number];
+  int evaluated = 0;
+  for (;;) {
+    const int32_t* columns = list.data();
+    int count = static_cast<int>(list.size());
+    Real reach = reach_[number];
+    if (snapshot_[number] == none) {
+      reach = cut_ + (present != none ? margin_ : static_cast<Real>(slack));
+      scratch.resize(columns_.padded() + block_size);
+      columns = scratch.data();
+      count = kernels_.candidates(view_, rows, exponent_, scale_, reach, scratch.data());
+      if (present != none) {
+        count = kernels_.select(view_, rows, exponent_, scale_, reach, scratch.data(), count);
+        list.assign(scratch.data(), scratch.data() + count);
+        std::copy_n(guess, block_size, listed_t_.data() + number * block_size);
+        snapshot_[number] = present;
+        reach_[number] = reach;
+      }
+    }
+    evaluated += count;
+    (with_gradient ? kernels_.evaluate_gradient : kernels_.evaluate)(view_, rows, exponent_, scale_, columns, count);
+
+    const auto [lowest, highest] = std::minmax_element(rows.log2_sum, rows.log2_sum + block_size);
+    if (*lowest >= cut_ - reach && *highest < far_off) return evaluated;
+    snapshot_[number] = none;
+    if (*lowest < -far_off || *highest >= far_off) kernels_.largest(view_, rows, exponent_, scale_);
+    for (int i = 0; i < block_size; ++i) guess[i] -= rows.log2_sum[i];
+    rows.t_largest = *std::max_element(guess, guess + block_size);
+  }
 }
 
 template class SoftMinimum<float>;

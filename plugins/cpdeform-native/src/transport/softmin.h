@@ -17,7 +17,8 @@ namespace cpdeform::transport {
 // or the block is computed again with t_i - log2 S. The result is that of all pairs for any guess; a good guess makes it fast.
 //
 // Lists of pairs may be kept from one update to the next. They were selected with a margin; once the potentials have grown by more
-// than that, they are made anew.
+// than that, they are made anew, for those blocks of rows alone that need it: after a few iterations the potentials of a handful of
+// points are the only ones that still move much.
 template <class Real>
 class SoftMinimum {
  public:
@@ -47,7 +48,10 @@ class SoftMinimum {
   Rows<Real> block(int number, Real* t) const;
   template <class Work>
   void for_blocks(Work&& work);
+  void forget();
+  void check_lists(const std::vector<Real>& t);
   const std::vector<Real>& pass(std::vector<Real>& t, std::vector<Real> (*gradient)[3], bool keep_lists);
+  int solve_block(Rows<Real>& rows, Real* guess, int number, std::vector<int32_t>& scratch, bool with_gradient, int present);
 
   Team& team_;
   const Kernels<Real>& kernels_;
@@ -59,8 +63,10 @@ class SoftMinimum {
   Columns<Real> view_{};
   std::vector<std::vector<int32_t>> scratch_;  // of each thread
   std::vector<std::vector<int32_t>> lists_;    // of each block
-  std::vector<Real> listed_t_, listed_h_;      // potentials that the lists were made for
-  bool listed_ = false;
+  std::vector<int> snapshot_;                  // of each block: which of `listed_h_` its list was made for, or `none`
+  std::vector<std::vector<Real>> listed_h_;    // columns' potentials when lists were made
+  std::vector<Real> listed_t_;                 // rows' potentials when their lists were made
+  std::vector<Real> reach_;                    // of each block: exponents below -reach may be missing in its list
   int64_t pairs_ = 0;
 };
 

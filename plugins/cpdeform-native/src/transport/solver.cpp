@@ -24,8 +24,8 @@ constexpr double self_tolerance = 0.01;  // of the step's tolerance: self-proble
 constexpr int self_iterations = 200;
 // Weakly linked points settle long after the marginals have.
 constexpr int least_iterations = 20;
-// Precision of a warm solution's soft minima: far beyond that of its few iterations.
-constexpr int warm_cut = 14, warm_margin = 3;
+// Precision of a warm solution's soft minima: beyond that of its few iterations.
+constexpr int warm_cut = 10, warm_margin = 3;
 
 template <class Real>
 const Kernels<Real>& kernels_of(InstructionSet set) {
@@ -85,7 +85,7 @@ int descend_ladder(Coupling<Real>& coupling, const std::vector<double>& steps, c
     coupling.descend_self(false, self_tolerance * tolerance, self_iterations);
     for (size_t i = 0; i < p.source.size(); ++i) p.source[i] += p.source_self[i];
     for (size_t j = 0; j < p.target.size(); ++j) p.target[j] += p.target_self[j];
-    used = coupling.descend(tolerance, least_iterations, options.iterations);
+    used = coupling.descend({tolerance, least_iterations, options.iterations, false});
     if (last) break;
     for (size_t i = 0; i < p.source.size(); ++i) p.source[i] -= p.source_self[i];
     for (size_t j = 0; j < p.target.size(); ++j) p.target[j] -= p.target_self[j];
@@ -157,14 +157,17 @@ template <class Real>
 Outcome solve(Team& team, InstructionSet set, const Options& options, const Arrays<Real>& arrays) {
   const Kernels<Real>& kernels = kernels_of<Real>(set);
   std::optional<Cloud<Real>> clouds[2];
+  Order orders[2] = {arrays.source_order, arrays.target_order};
   team.run([&](int thread) {
-    if (thread == 0) clouds[0].emplace(arrays.source, arrays.source_weights, arrays.source_count);
-    if (thread == 1 % team.size()) clouds[1].emplace(arrays.target, arrays.target_weights, arrays.target_count);
+    if (thread == 0) clouds[0].emplace(arrays.source, arrays.source_weights, arrays.source_count, orders[0]);
+    if (thread == 1 % team.size()) clouds[1].emplace(arrays.target, arrays.target_weights, arrays.target_count, orders[1]);
   });
   const Cloud<Real>&source = *clouds[0], &target = *clouds[1];
   Coupling<Real> coupling(team, kernels, source, target, options.exponent);
   Potentials<Real>& p = coupling.potentials();
   Outcome outcome{};
+  outcome.source_extent = orders[0].extent;
+  outcome.target_extent = orders[1].extent;
   if (options.warm) {
     source.gather(arrays.source_potential, p.source);
     target.gather(arrays.target_potential, p.target);
@@ -172,7 +175,7 @@ Outcome solve(Team& team, InstructionSet set, const Options& options, const Arra
     target.gather(arrays.target_self, p.target_self);
     coupling.set_temperature(std::pow(options.blur, options.exponent));
     coupling.set_cut(warm_cut, warm_margin);
-    outcome.iterations = coupling.descend(options.warm_tolerance, 1, options.warm_iterations);
+    outcome.iterations = coupling.descend({options.warm_tolerance, 1, options.warm_iterations, true});
     if (options.debias) {
       coupling.descend_self(true, options.warm_tolerance, options.warm_iterations);
       if (!options.same_target) coupling.descend_self(false, self_tolerance * options.tolerance, self_iterations);

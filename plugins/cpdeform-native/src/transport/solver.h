@@ -20,7 +20,8 @@ struct Options {
 };
 
 // The caller's arrays: points (N, 3) and (M, 3), weights, and potentials in units of the cost, which hold the start of a warm
-// solution and receive the result, biased. `gradient` (N, 3) is that of the cost by the source's points, debiased if wanted.
+// solution and receive the result, biased. `gradient` (N, 3) is that of the cost by the source's points, debiased if wanted. The
+// orders of an earlier solution spare sorting the points.
 template <class Real>
 struct Arrays {
   const Real* source;
@@ -34,11 +35,13 @@ struct Arrays {
   Real* source_self;
   Real* target_self;
   Real* gradient;
+  Order source_order, target_order;
 };
 
 struct Outcome {
   int iterations;        // at the final temperature
   double marginal_error;
+  double source_extent, target_extent;  // of the orders used
 };
 
 template <class Real>

@@ -1,0 +1,275 @@
+"""`cpdeform experiment`: the paper's experiments, each a table of runs."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cpdeform.cli.bench_output import check_device, split_names, split_numbers
+
+if TYPE_CHECKING:
+    from cpdeform.core.plugins import Registry
+    from cpdeform.core.result import Observer
+    from cpdeform.experiments.experiment_plan import ExperimentSettings, PlannedRun
+    from cpdeform.experiments.experiment_row import ExperimentRow
+
+experiment = typer.Typer(no_args_is_help=True, help="Run the paper's experiments, with a record of each run and a table of all.")
+
+Tasks = Annotated[
+    str | None, typer.Option(help="Names or YAML files, separated by commas.  [default: all of the experiment]", metavar="NAMES")
+]
+Methods = Annotated[
+    str | None,
+    typer.Option(help="Of cpdeform, paper, fixed and random, separated by commas.  [default: cpdeform,fixed]", metavar="NAMES"),
+]
+Seeds = Annotated[str | None, typer.Option(help="Seeds, separated by commas.  [default: 0]", metavar="NUMBERS")]
+Iterations = Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: the task's, or 40]")]
+Stages = Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")]
+Particles = Annotated[
+    int | None, typer.Option(help="Particles of all bodies together; goals stay as they are.  [default: the task's]")
+]
+Targets = Annotated[
+    Path | None, typer.Option(help="Directory with a goal <task>.npz for every task, instead of their own.", metavar="DIR")
+]
+Backend = Annotated[str | None, typer.Option(help="Simulator; auto: the fastest installed.  [default: auto]", metavar="NAME")]
+Ot = Annotated[str | None, typer.Option(help="Optimal-transport solver.  [default: auto]", metavar="NAME")]
+Device = Annotated[str | None, typer.Option(help="cpu or cuda.  [default: cpu]", metavar="NAME")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Any other option of `cpdeform run`, for all runs; repeatable.", metavar="KEY=VALUE"),
+]
+Equal = Annotated[
+    bool, typer.Option("--equal-evaluations", help="Give fixed as many gradient evaluations per stage as cpdeform used.")
+]
+PaperMetric = Annotated[bool, typer.Option("--paper-metric", help="Also take W1 with the paper's settings.")]
+Out = Annotated[
+    Path | None, typer.Option(help="Directory of records and tables.  [default: experiments/<experiment>]", metavar="DIR")
+]
+Resume = Annotated[
+    bool, typer.Option("--resume/--no-resume", help="Read runs that are recorded with the same configuration instead of running.")
+]
+NoRun = Annotated[
+    bool, typer.Option("--no-run", help="Run nothing; make the tables anew of all records in --out, or of those asked for.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line.")]
+
+
+@experiment.command("multi-stage")
+def multi_stage_command(
+    tasks: Tasks = None,
+    methods: Methods = None,
+    seeds: Seeds = None,
+    iterations: Iterations = None,
+    stages: Stages = None,
+    particles: Particles = None,
+    targets: Targets = None,
+    backend: Backend = None,
+    ot: Ot = None,
+    device: Device = None,
+    settings: Settings = None,
+    equal_evaluations: Equal = False,
+    paper_metric: PaperMetric = False,
+    out: Out = None,
+    resume: Resume = True,
+    no_run: NoRun = False,
+    as_json: Json = False,
+) -> None:
+    """Run the multi-stage tasks, judged by W1 between the clay and its goal.
+
+    Exit code 0: there are figures; 1: no run has any; 2: unusable input; 130: interrupted (the table holds what was done).
+    """
+    _command("multi-stage", {**locals(), "variants": ""})
+
+
+@experiment.command("single-stage")
+def single_stage_command(
+    tasks: Tasks = None,
+    variants: Annotated[str, typer.Option(help="Variants of every task, separated by commas.", metavar="NAMES")] = "v1,v2,v3",
+    methods: Methods = None,
+    seeds: Seeds = None,
+    iterations: Iterations = None,
+    stages: Stages = None,
+    particles: Particles = None,
+    targets: Targets = None,
+    backend: Backend = None,
+    ot: Ot = None,
+    device: Device = None,
+    settings: Settings = None,
+    equal_evaluations: Equal = False,
+    paper_metric: PaperMetric = False,
+    out: Out = None,
+    resume: Resume = True,
+    no_run: NoRun = False,
+    as_json: Json = False,
+) -> None:
+    """Run PlasticineLab's single-stage tasks, judged by the normalised incremental IoU.
+
+    A task's name with a variant, such as move-v4, or a YAML file is run as it is.
+
+    Exit code 0: there are figures; 1: no run has any; 2: unusable input; 130: interrupted (the table holds what was done).
+    """
+    _command("single-stage", locals())
+
+
+def _command(name: str, given: dict[str, Any]) -> None:
+    """Run an experiment, or only make its tables, and print the outcome."""
+    from cpdeform.experiments.experiment_tables import write_tables
+
+    given = dict(given)
+    as_json, no_run, resume = (given.pop(key) for key in ("as_json", "no_run", "resume"))
+    given["out"] = given["out"] or Path("experiments") / name
+    rows: list[ExperimentRow] = []
+    with contextlib.redirect_stdout(sys.stderr):
+        # Some backends greet on stdout when they are imported.
+        source, planned, settings = (_recorded if no_run else _run)(name, given, resume=resume)
+        if no_run:
+            rows.extend(source)
+            write_tables(name, rows, given["out"], planned=planned)
+        else:
+            _collect(name, rows, source, given["out"], planned=planned)
+    _report(name, rows, settings, given["out"], as_json=as_json)
+
+
+def _collect(name: str, rows: list[ExperimentRow], source: Iterator[ExperimentRow], out: Path, *, planned: int) -> None:
+    """Take rows as they come; the tables are written after each."""
+    from cpdeform.experiments.experiment_tables import write_tables
+
+    try:
+        for row in source:
+            rows.append(row)
+            write_tables(name, rows, out, planned=planned)
+            typer.echo(f"{len(rows)}/{planned}  {_row_line(row)}", err=True)
+    except KeyboardInterrupt as error:
+        left = f"{out / 'table.md'} holds the {len(rows)} runs that are done" if rows else "no run was done"
+        typer.echo(f"cpdeform: interrupted; {left}; the same command goes on from here", err=True)
+        raise typer.Exit(130) from error
+
+
+def _recorded(name: str, given: dict[str, Any], *, resume: bool) -> tuple[Iterator[ExperimentRow], int, dict[str, Any]]:
+    """Rows of the records that are there."""
+    from cpdeform.experiments.experiment import recorded_runs
+    from cpdeform.experiments.experiment_row import read_row
+
+    tasks, methods, seeds = given["tasks"], given["methods"], given["seeds"]
+    runs = recorded_runs(
+        given["out"],
+        tasks=None if tasks is None else [Path(task).stem for task in split_names(tasks, "--tasks")],
+        methods=None if methods is None else split_names(methods, "--methods"),
+        seeds=None if seeds is None else split_numbers(seeds, "--seeds"),
+    )
+    rows = (read_row(run, paper_metric=given["paper_metric"], reused=True) for run in runs)
+    return rows, len(runs), {"out": str(given["out"])}
+
+
+def _run(name: str, given: dict[str, Any], *, resume: bool) -> tuple[Iterator[ExperimentRow], int, dict[str, Any]]:
+    """Rows of runs that are made, or read where they are recorded."""
+    from cpdeform.core.plugins import load_registry
+    from cpdeform.experiments.experiment import run_experiment
+    from cpdeform.experiments.experiment_plan import planned_runs
+    from cpdeform.experiments.experiment_row import without_directories
+
+    registry = load_registry()
+    settings = _settings(name, given, registry)
+    runs = planned_runs(settings, registry=registry)
+    command = without_directories(shlex.join(_command_line(name, given)))
+    observe = _observer(settings, command, registry)
+    rows = run_experiment(settings, runs, registry=registry, resume=resume, observe=observe)
+    return rows, len(runs), dataclasses.asdict(settings)
+
+
+def _settings(name: str, given: dict[str, Any], registry: Registry) -> ExperimentSettings:
+    from cpdeform.core.plugins import split_options
+    from cpdeform.experiments.experiment_plan import TASKS, ExperimentSettings, expand_tasks
+
+    values = {key: value for key, value in given.items() if value is not None}
+    names = split_names(values.pop("tasks"), "--tasks") if "tasks" in values else TASKS[name]
+    variants = values.pop("variants")
+    tasks = expand_tasks(names, split_names(variants, "--variants") if variants else (), registry=registry)
+    if "device" in values:
+        check_device(values["device"])
+    if "methods" in values:
+        values["methods"] = tuple(split_names(values["methods"], "--methods"))
+    if "seeds" in values:
+        values["seeds"] = split_numbers(values["seeds"], "--seeds")
+    return ExperimentSettings(name=name, tasks=tasks, options=split_options(values.pop("settings", [])), **values)
+
+
+def _command_line(name: str, given: dict[str, Any]) -> Iterator[str]:
+    """The command that was given, with all options that are not the default."""
+    yield from ("cpdeform", "experiment", name)
+    for key, value in given.items():
+        if key == "settings":
+            for setting in value or ():
+                yield from ("--set", setting)
+        elif value is True:
+            yield f"--{key.replace('_', '-')}"
+        elif value not in (None, False, ""):
+            yield from (f"--{key.replace('_', '-')}", str(value))
+
+
+def _observer(
+    settings: ExperimentSettings, command: str, registry: Registry
+) -> Callable[[PlannedRun], contextlib.AbstractContextManager[Sequence[Observer]]]:
+    """Shows the progress of each run on stderr; with the first one, this session is noted in the directory."""
+    noted = False
+
+    @contextlib.contextmanager
+    def observe(run: PlannedRun) -> Iterator[Sequence[Observer]]:
+        from cpdeform.cli.progress import ProgressBar, ProgressLines
+        from cpdeform.experiments.experiment_tables import note_session
+        from cpdeform.experiments.tables import describe_machine, describe_versions
+
+        nonlocal noted
+        if not noted:
+            machine = describe_machine(device=settings.device or "cpu")
+            note_session(settings.out, command=command, machine=machine, versions=describe_versions(registry))
+            noted = True
+        typer.echo(f"{run.task}, {run.method}, seed {run.seed}", err=True)
+        if sys.stderr.isatty():
+            with ProgressBar(stages=settings.stages) as bar:
+                yield [bar]
+        else:
+            yield [ProgressLines()]
+
+    return observe
+
+
+def _row_line(row: ExperimentRow) -> str:
+    from cpdeform.experiments.tables import cell
+
+    found = " (found)" if row.reused else ""
+    text = f"{row.task}, {row.method}, seed {row.seed}: {row.status.replace('_', ' ')}{found}"
+    if row.has_figures:
+        figures = f"W1 {cell(row.w1_initial, '.4g')} -> {cell(row.w1_final, '.4g')}, IoU {cell(row.incremental_iou, '.2f')}"
+        text += f", {figures}, {row.gradient_evaluations} gradient evaluations, {row.seconds:.0f} s"
+    return f"{text}; {row.reason}" if row.reason else text
+
+
+def _report(name: str, rows: Sequence[ExperimentRow], settings: dict[str, Any], out: Path, *, as_json: bool) -> None:
+    """Print the tables, or one JSON object; exit code 1 where no run has figures."""
+    from cpdeform.core.record_files import to_json
+    from cpdeform.experiments.experiment_tables import TABLE_FILE, paper_figures, read_sessions, sorted_rows
+
+    if as_json:
+        content = {
+            "experiment": name,
+            "rows": [dataclasses.asdict(row) for row in sorted_rows(rows)],
+            "paper": dataclasses.asdict(paper_figures(name)),
+            "sessions": read_sessions(out),
+            "settings": settings,
+            "out": str(out),
+        }
+        typer.echo(json.dumps(to_json(content), default=str))
+    else:
+        typer.echo((out / TABLE_FILE).read_text(encoding="utf-8"))
+        typer.echo(f"written to {out / TABLE_FILE}")
+    if not any(row.has_figures for row in rows):
+        raise typer.Exit(1)

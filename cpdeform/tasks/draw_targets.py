@@ -1,0 +1,128 @@
+"""Draw start and target of tasks onto contact sheets: `python -m cpdeform.tasks.draw_targets [--out docs/pictures]`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from cpdeform.core.plugins import Registry, load_registry
+from cpdeform.core.sampling import sample_particles
+from cpdeform.core.state import manipulator_pose
+from cpdeform.core.task import Task, list_variants, load_task, task_path
+from cpdeform.report.pictures import View, clay_colours, draw_scene
+from cpdeform.report.render import fit_camera
+from cpdeform.report.shapes import tool_surface
+
+Array = NDArray[np.float64]
+
+AZIMUTH = 28.0
+ELEVATION = 42.0
+PANEL_ASPECT = 1.3
+PANEL_WIDTH = 260
+"""Width of a drawn panel, pixels."""
+
+SHEETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "targets-multi-stage-1": ("airplane", "chair", "bottle", "star"),
+        "targets-multi-stage-2": ("move++", "rope++", "writer++", "pinch"),
+        "targets-single-stage-1": ("move", "triple-move", "torus"),
+        "targets-single-stage-2": ("rope", "rolling-pin", "writer"),
+        "targets-single-stage-3": ("chopsticks", "assembly", "table"),
+    }
+)
+"""The tasks on each contact sheet. A task with variants fills two rows, starts and targets; another one two panels."""
+
+
+def main(
+    out: Annotated[Path, typer.Option(help="Directory that the pictures are written to.")] = Path("docs/pictures"),
+    sheet: Annotated[list[str] | None, typer.Option(help="A sheet to draw; all where absent. May be repeated.")] = None,
+) -> None:
+    """Draw the contact sheets."""
+    registry = load_registry()
+    out.mkdir(parents=True, exist_ok=True)
+    for name in sheet or SHEETS:
+        path = draw_sheet(SHEETS[name], out / f"{name}.png", registry=registry)
+        typer.echo(f"{path}: {path.stat().st_size // 1000} kB")
+
+
+def draw_sheet(names: tuple[str, ...], path: Path, *, registry: Registry) -> Path:
+    """Draw tasks onto one picture.
+
+    Args:
+        names: Tasks without variants. The first one decides: all of them have variants, or none has.
+        path: The PNG file.
+        registry: Where to look the tasks up.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    variants = [list_variants(task_path(name, registry=registry)) for name in names]
+    if variants[0]:
+        columns = [[f"{name}-{variant}" for variant in found] for name, found in zip(names, variants, strict=True)]
+    else:
+        columns = [list(names)]
+    shape = (2 * len(columns), max(len(row) for row in columns))
+    width, height = 2.1 * shape[1], (2.1 / PANEL_ASPECT + 0.16) * shape[0]
+    figure = Figure(figsize=(width, height), dpi=100, facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.subplots(*shape, squeeze=False)
+    figure.subplots_adjust(left=0.005, right=0.995, bottom=0.005, top=1.0 - 0.16 / height, wspace=0.02, hspace=0.1)
+    for row, tasks in enumerate(columns):
+        for column, name in enumerate(tasks):
+            _draw_pair(axes[2 * row, column], axes[2 * row + 1, column], load_task(name, registry=registry))
+    _save(canvas, path)
+    return path
+
+
+def _draw_pair(upper: Any, lower: Any, task: Task) -> None:
+    """Draw a task's start with its tools above, its target below."""
+    start, target = sample_particles(task.scene), task.load_target()
+    pose = manipulator_pose(task.scene).numpy()
+    tools = [tool_surface(tool, pose[index], rows=220, columns=320) for index, tool in enumerate(task.scene.manipulators)]
+    view = _make_view(task, start, target, tools)
+    draw_scene(upper, view, start, clay_colours(view, start), tools, width=PANEL_WIDTH)
+    upper.set_title(f"{task.name}: start", fontsize=7, pad=1.5)
+    view = dataclasses.replace(view, radius=_particle_radius(target))
+    draw_scene(lower, view, target, clay_colours(view, target), [], width=PANEL_WIDTH)
+    lower.set_title("target", fontsize=7, pad=1.5)
+
+
+def _make_view(task: Task, start: Array, target: Array, tools: list[Array]) -> View:
+    clay = np.concatenate([start, target])
+    low, high = clay.min(axis=0), clay.max(axis=0)
+    # A tool may lie under the floor, as a fixed pillar does; only what is above it is worth the room.
+    ground = task.scene.ground_height
+    shapes = [surface.reshape(-1, 3) for surface in tools]
+    shapes = [surface[surface[:, 1] >= ground] for surface in shapes]
+    x, z = (low[0] - 0.03, high[0] + 0.03), (low[2] - 0.03, high[2] + 0.03)
+    floor = np.array([[x[0], ground, z[0]], [x[1], ground, z[0]], [x[1], ground, z[1]], [x[0], ground, z[1]], [x[0], ground, z[0]]])
+    camera = fit_camera(np.concatenate([clay, floor, *shapes]), azimuth=AZIMUTH, elevation=ELEVATION, aspect=PANEL_ASPECT, margin=0.03)
+    return View(camera, _particle_radius(start), float(low[1]), float(high[1]), floor)
+
+
+def _particle_radius(positions: Array) -> float:
+    """Radius at which the balls of a cloud (N, 3) touch and close its surface, length units."""
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(positions).query(positions, k=8)
+    return float(np.clip(0.95 * np.median(distance[:, -1]), 1e-3, 0.05))
+
+
+def _save(canvas: Any, path: Path) -> None:
+    """Write a PNG file of 256 colours: a third of the size, and no difference to see."""
+    from PIL import Image
+
+    canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    picture.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,49 @@
+"""What a run is made of: what the user sets, above what the algorithm prescribes, above what the task says."""
+
+from __future__ import annotations
+
+import pytest
+
+from cpdeform.core.configuration import PAPER_PLACER_OPTIONS, RunConfiguration, with_task_settings
+from cpdeform.core.errors import InputError
+from cpdeform.core.task import load_task
+
+
+@pytest.fixture
+def task(make_toy_task):
+    settings = {
+        "optimizer": {"iterations": 7, "learning_rate": 0.05},
+        "objective": {"kind": "plasticinelab"},
+        "placer_options": {"poses": ["current"], "attempts": 2},
+    }
+    return load_task(make_toy_task(settings=settings))
+
+
+def test_the_task_fills_in_what_the_user_leaves_open(task):
+    asked = RunConfiguration.model_validate({"optimizer": {"iterations": 3}, "placer_options": {"attempts": 1}})
+    found = with_task_settings(asked, task)
+    assert (found.optimizer.iterations, found.optimizer.learning_rate, found.optimizer.patience) == (3, 0.05, 15)
+    assert found.objective.kind == "plasticinelab"
+    assert found.placer_options == {"poses": ["current"], "attempts": 1}
+    assert with_task_settings(found, task) == found
+
+
+def test_options_of_the_tasks_placer_do_not_go_to_another_one(task):
+    assert with_task_settings(RunConfiguration(placer="random"), task).placer_options == {}
+    paper = with_task_settings(RunConfiguration(placer="fixed", algorithm="paper"), task)
+    assert paper.placer_options == {}
+    assert paper.optimizer.schedule == "paper"
+
+
+def test_the_papers_algorithm_goes_above_the_tasks_settings(task):
+    found = with_task_settings(RunConfiguration(algorithm="paper"), task)
+    assert found.placer_options == dict(PAPER_PLACER_OPTIONS)
+    assert (found.optimizer.schedule, found.optimizer.iterations) == ("paper", 7)
+    mine = RunConfiguration.model_validate({"algorithm": "paper", "optimizer": {"schedule": "halving"}})
+    assert with_task_settings(mine, task).optimizer.schedule == "halving"
+
+
+def test_unknown_settings_of_a_task_are_named(make_toy_task):
+    task = load_task(make_toy_task(settings={"optimizer": {"iteration": 3}}))
+    with pytest.raises(InputError, match=r"task shift: settings.*iteration.*iterations"):
+        with_task_settings(RunConfiguration(), task)
