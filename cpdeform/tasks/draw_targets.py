@@ -103,7 +103,9 @@ def _make_view(task: Task, start: Array, target: Array, tools: list[Array]) -> V
     shapes = [surface[surface[:, 1] >= ground] for surface in shapes]
     x, z = (low[0] - 0.03, high[0] + 0.03), (low[2] - 0.03, high[2] + 0.03)
     floor = np.array([[x[0], ground, z[0]], [x[1], ground, z[0]], [x[1], ground, z[1]], [x[0], ground, z[1]], [x[0], ground, z[0]]])
-    camera = fit_camera(np.concatenate([clay, floor, *shapes]), azimuth=AZIMUTH, elevation=ELEVATION, aspect=PANEL_ASPECT, margin=0.03)
+    camera = fit_camera(
+        np.concatenate([clay, floor, *shapes]), azimuth=AZIMUTH, elevation=ELEVATION, aspect=PANEL_ASPECT, margin=0.03
+    )
     return View(camera, _particle_radius(start), float(low[1]), float(high[1]), floor)
 
 
