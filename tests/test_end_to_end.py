@@ -17,10 +17,10 @@ from cpdeform.backends.warp.simulator import SimulatorWarp
 from cpdeform.cli.main import app
 from cpdeform.core.record import load_record
 from cpdeform.core.result import Status
+from cpdeform.core.target import write_target
 from cpdeform.ot.geomloss import OTSolverGeomLoss
 from cpdeform.ot.pot import OTSolverPOT
-from cpdeform.tasks.make_targets import write_target
-from cpdeform.tasks.strokes import Stroke, draw
+from cpdeform.tasks.scripts import Leg, perform
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 SCENE: dict[str, Any] = {
@@ -39,14 +39,14 @@ SCENE: dict[str, Any] = {
     "ground_friction": 100.0,
     "grid_size": 32,
 }
-STROKE = Stroke((0.38, 0.271, 0.62), ((3, (0.0, -1.0, 0.0)), (2, (0.5, -0.3, -0.5))))
+STROKE = (Leg(3, {0: (0.0, -1.0, 0.0)}, {0: (0.38, 0.271, 0.62)}), Leg(2, {0: (0.5, -0.3, -0.5)}))
 
 
 @pytest.fixture(scope="module")
 def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Task file of a small board with a stroke away from the pen's start."""
     folder = tmp_path_factory.mktemp("board")
-    write_target(folder / "target.npz", draw(STROKE, SimulatorWarp(Scene.model_validate(SCENE), dtype=torch.float64)))
+    write_target(folder / "target.npz", perform(STROKE, SimulatorWarp(Scene.model_validate(SCENE), dtype=torch.float64)))
     path = folder / "board.yaml"
     content = {"name": "board", "scene": SCENE, "target": "target.npz", "step_count": 5, "metric": "incremental_iou"}
     path.write_text(yaml.safe_dump(content))

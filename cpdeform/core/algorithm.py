@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from cpdeform.core.metrics import evaluate_metric
 from cpdeform.core.objective import Objective
 from cpdeform.core.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
 from cpdeform.core.ot import OTSolver
-from cpdeform.core.placer import Placement, PlacementResult, Placer, Stage
+from cpdeform.core.placer import LEAST_GAIN, Placement, PlacementResult, Placer, Stage
 from cpdeform.core.result import DeformResult, Observer, StageResult, Status
 from cpdeform.core.scene import Scene
 from cpdeform.core.signed_distance import signed_distance
@@ -60,7 +60,14 @@ class Planner:
     observers: tuple[Observer, ...] = ()
     names: dict[str, str] = dataclasses.field(default_factory=dict)
 
-    def run(self, *, stages: int | None = None, state: State | None = None, first_stage: int = 0) -> DeformResult:
+    def run(
+        self,
+        *,
+        stages: int | None = None,
+        state: State | None = None,
+        first_stage: int = 0,
+        previous: Sequence[StageResult] = (),
+    ) -> DeformResult:
         """Run Algorithm 1.
 
         Args:
@@ -68,6 +75,7 @@ class Planner:
             state: Where to start, a single world, e.g. the last state of a run record; the scene's start where absent.
             first_stage: Number of the first stage: of one that goes on from a record, `RunRecord.next_stage`. With the seed it
                 determines the random numbers, so that a run that is resumed equals one that went through.
+            previous: The stages before the first one, of a run that goes on: contact points that failed there are not tried again.
 
         Returns:
             Every stage, and how the run ended. A stage that fails ends the run; what came before is kept.
@@ -93,7 +101,8 @@ class Planner:
         results: list[StageResult] = []
         # "for each stage:"
         for index in range(first_stage, first_stage + count):
-            result = self._stage(index, state, target, stage_generator(self.seed, index))
+            failed = failed_contacts([*previous, *results])
+            result = self._stage(index, state, target, stage_generator(self.seed, index), failed)
             results.append(result)
             for observer in self.observers:
                 observer.stage_finished(result)
@@ -150,7 +159,7 @@ class Planner:
         self.simulator.check_inputs(state, actions)
         return state
 
-    def _stage(self, index: int, state: State, target: Tensor, generator: torch.Generator) -> StageResult:
+    def _stage(self, index: int, state: State, target: Tensor, generator: torch.Generator, failed: tuple[int, ...]) -> StageResult:
         """One stage: priorities, placements, plans, execution of the best."""
         seconds: dict[str, float] = {}
         clock = _Clock(seconds)
@@ -162,7 +171,7 @@ class Planner:
         if self.placer.capabilities.needs_priorities:
             priorities = self.ot_solver.solve(state.position[0], target).source_potential
         clock.lap("transport")
-        stage = Stage(index, self.task.scene, state, target, priorities, generator, loss_before)
+        stage = Stage(index, self.task.scene, state, target, priorities, generator, loss_before, failed)
         candidates: list[PlacementResult] = []
         history: list[Iteration] = []
         evaluations = 0
@@ -257,6 +266,17 @@ def stage_generator(seed: int, index: int) -> torch.Generator:
     if index > 0:
         seed = int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
     return torch.Generator().manual_seed(seed)
+
+
+def failed_contacts(stages: Sequence[StageResult]) -> tuple[int, ...]:
+    """Contact particles of the candidates of all stages since the last one that gained at least `LEAST_GAIN`."""
+    found: list[int] = []
+    for stage in reversed(stages):
+        if stage.loss < (1.0 - LEAST_GAIN) * stage.loss_before:
+            break
+        contacts = [candidate.placement.contact_particle for candidate in stage.candidates]
+        found += [contact for contact in contacts if contact is not None]
+    return tuple(dict.fromkeys(found))
 
 
 def check_tools_outside(scene: Scene, state: State) -> None:

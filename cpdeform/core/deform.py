@@ -24,7 +24,7 @@ from cpdeform.core.simulator import Simulator
 from cpdeform.core.state import State
 from cpdeform.core.task import Task, changed_task, load_task
 
-MAX_WORLDS = 8
+MAX_WORLDS = 16
 """Candidates that are solved as one batch; more are solved in several."""
 
 
@@ -159,7 +159,12 @@ def deform_configuration(
     )
     if resumption is None:
         return planner.run(stages=configuration.stages)
-    return planner.run(stages=configuration.stages, state=resumption.state, first_stage=resumption.first_stage)
+    return planner.run(
+        stages=configuration.stages,
+        state=resumption.state,
+        first_stage=resumption.first_stage,
+        previous=resumption.record.stages,
+    )
 
 
 def resolved(configuration: RunConfiguration, *, registry: Registry) -> RunConfiguration:

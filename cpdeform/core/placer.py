@@ -12,6 +12,9 @@ from torch import Tensor
 from cpdeform.core.scene import Scene
 from cpdeform.core.state import State
 
+LEAST_GAIN = 0.01
+"""Relative gain of a stage's loss below which its contact points count as failed."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
@@ -25,6 +28,7 @@ class Stage:
         priorities: Transport priorities f (N,), cost units; nan where the placer declared that it needs none.
         generator: Source of randomness on the CPU, seeded by the run.
         loss: Loss of leaving the state as it is, objective units; nan where it is unknown.
+        failed_contacts: Contact particles of the candidates of all stages since the last one that gained at least `LEAST_GAIN`.
     """
 
     index: int
@@ -34,6 +38,7 @@ class Stage:
     priorities: Tensor
     generator: torch.Generator
     loss: float = float("nan")
+    failed_contacts: tuple[int, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,8 @@ class Exploration:
         bodies: Index (N,) of each particle's body.
         ranking: Bodies, that of the highest mean priority first.
         explored: Particles (N,) that are not proposed again.
-        attempt: Number of rounds so far.
+        radius: Distance from a contact point within which particles count as explored, length units.
+        attempt: Number of contact points so far.
     """
 
     stage: Stage
@@ -30,11 +31,16 @@ class Exploration:
     bodies: Tensor
     ranking: list[int]
     explored: Tensor
+    radius: float
     attempt: int = 0
 
     @classmethod
-    def begin(cls, stage: Stage) -> Exploration:
-        """Nothing is explored yet.
+    def begin(cls, stage: Stage, *, radius: float) -> Exploration:
+        """Explored is what lies around the contact points that gained nothing before.
+
+        Args:
+            stage: The stage.
+            radius: Distance from a contact point within which particles count as explored, length units.
 
         Raises:
             InputError: The priorities are not finite, or do not fit the particles.
@@ -52,7 +58,17 @@ class Exploration:
         sums = torch.zeros(count, dtype=torch.float64, device=particles.device).index_add(0, bodies, priorities.double())
         means = sums / torch.bincount(bodies, minlength=count)
         ranking = means.argsort(descending=True, stable=True).tolist()
-        return cls(stage, priorities, bodies, ranking, torch.zeros_like(bodies, dtype=torch.bool))
+        exploration = cls(stage, priorities, bodies, ranking, torch.zeros_like(bodies, dtype=torch.bool), radius)
+        for contact in stage.failed_contacts:
+            exploration.explore(contact)
+        for body in range(count):
+            if bool(exploration.explored[bodies == body].all()):
+                exploration.explored[bodies == body] = False
+        return exploration
+
+    def explore(self, contact: int) -> None:
+        """Count the surroundings of a particle as explored."""
+        self.explored |= self.near(contact, self.radius)
 
     def contact(self, body: int, *, excluded: Tensor | None = None) -> int | None:
         """The particle of a body with the largest priority that is neither explored nor excluded (N,); None where none is left."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.placer import Placement, PlacementResult, Placer, PlacerCapabilities, Stage
+from cpdeform.core.placer import LEAST_GAIN, Placement, PlacementResult, Placer, PlacerCapabilities, Stage
 from cpdeform.core.scene import Manipulator
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.placement.grasp import TOOLS_PER_GRASP, Cost, GraspSearch
@@ -17,6 +17,9 @@ from cpdeform.placement.pose import APART, CURRENT, DIRECT, GRASP_DIRECTIONS, ch
 from cpdeform.placement.priorities import Exploration
 from cpdeform.placement.tool import tool_half_extents
 from cpdeform.placement.touch import reduce_distances
+
+EXPLORED_RADIUS = 2.0
+"""Distance from a contact point within which particles count as explored, in half widths of the narrowest tool."""
 
 CURRENT_DEPTH = 1e-3
 """How deep a tool that stays where it is may reach into the body, length units."""
@@ -37,8 +40,9 @@ class PlacerTransport(Placer):
     corner of the grid. The default, a tool's radius, makes the neighbourhood count. The score depends on the gauge of the
     priorities, which is fixed by `OTResult`: zero weighted median.
 
-    Where no candidate of a stage lowers the loss, the particles around the contact point count as explored, and the next body
-    or the next priority is tried.
+    Where no candidate of a stage lowers the loss by `least_gain`, the particles around the contact point count as explored, and
+    the next body or the next priority is tried; they stay explored in the following stages until one of these gains more
+    (`Stage.failed_contacts`).
 
     Args:
         grid_size: Positions along each axis of a single tool's grids (the paper: 20).
@@ -55,6 +59,7 @@ class PlacerTransport(Placer):
             reach into the body). Where absent ``"direct"`` for one movable tool, the first three for several.
         attempts: The most rounds of candidates in a stage.
         contacts: Contact points proposed in one round.
+        least_gain: Relative gain from which a stage counts as a success.
 
     Raises:
         InputError: An option is out of range.
@@ -78,17 +83,20 @@ class PlacerTransport(Placer):
         poses: Sequence[str] | None = None,
         attempts: int = 3,
         contacts: int = 1,
+        least_gain: float = LEAST_GAIN,
     ) -> None:
         if not 0.0 < distance_scale < float("inf"):
             raise InputError("distance_scale", came=str(distance_scale), expected="a finite number above 0")
         for name, number in (("attempts", attempts), ("contacts", contacts)):
             if number < 1:
                 raise InputError(name, came=str(number), expected="at least 1")
+        if not 0.0 <= least_gain < 1.0:
+            raise InputError("least_gain", came=str(least_gain), expected="a share of at least 0 and below 1")
         self.options = GridOptions(
             grid_size=grid_size, refinements=refinements, clearance=clearance, margin=margin, max_gap=max_gap
         )
         self.distance_scale, self.attempts, self.contacts = distance_scale, attempts, contacts
-        self.poses = check_poses(poses)
+        self.poses, self.least_gain = check_poses(poses), least_gain
         self._exploration: Exploration | None = None
 
     def ask(self, stage: Stage) -> list[Placement]:
@@ -102,9 +110,10 @@ class PlacerTransport(Placer):
             InputError: The priorities are not finite, or do not fit the particles.
         """
         movable = movable_manipulators(stage)
-        if self._exploration is None or self._exploration.stage is not stage:
-            self._exploration = Exploration.begin(stage)
         exploration = self._exploration
+        if exploration is None or exploration.stage is not stage:
+            narrowest = min(_half_width(stage.scene.manipulators[index]) for index in movable)
+            exploration = self._exploration = Exploration.begin(stage, radius=EXPLORED_RADIUS * narrowest)
         placements: list[Placement] = []
         while not placements and exploration.attempt < self.attempts * self.contacts:
             for _ in range(self.contacts):
@@ -116,9 +125,11 @@ class PlacerTransport(Placer):
     def tell(self, results: list[PlacementResult]) -> bool:
         """Ask again as long as nothing lowered the loss and attempts are left."""
         exploration = self._exploration
-        if exploration is None or exploration.attempt >= self.attempts * self.contacts:
+        if exploration is None:
             return False
-        return not any(result.loss < exploration.stage.loss for result in results)
+        enough = (1.0 - self.least_gain) * exploration.stage.loss
+        gained = any(result.loss < enough for result in results)
+        return not gained and exploration.attempt < self.attempts * self.contacts
 
     def _round(self, exploration: Exploration, movable: Sequence[int], *, first: bool) -> list[Placement]:
         """Candidates around the next contact point, whose surroundings then count as explored."""
@@ -137,8 +148,7 @@ class PlacerTransport(Placer):
                 found.append(self._apart(exploration, movable, pose, contact))
             else:
                 found.append(self._direct(exploration, movable[0], contact))
-        width = min(_half_width(stage.scene.manipulators[index]) for index in movable)
-        exploration.explored |= exploration.near(contact, width)
+        exploration.explore(contact)
         return [placement for placement in found if placement is not None]
 
     def _cost(self, exploration: Exploration) -> Cost:

@@ -25,8 +25,8 @@ Array = NDArray[np.float64]
 AZIMUTH = 28.0
 ELEVATION = 42.0
 PANEL_ASPECT = 1.3
-PANEL_WIDTH = 260
-"""Width of a drawn panel, pixels."""
+PANEL_WIDTHS = {True: 2.2, False: 3.6}
+"""Width of a panel on sheets of tasks with variants and on the others, inches of 100 pixels."""
 
 SHEETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -69,28 +69,30 @@ def draw_sheet(names: tuple[str, ...], path: Path, *, registry: Registry) -> Pat
     else:
         columns = [list(names)]
     shape = (2 * len(columns), max(len(row) for row in columns))
-    width, height = 2.1 * shape[1], (2.1 / PANEL_ASPECT + 0.16) * shape[0]
+    panel = PANEL_WIDTHS[bool(variants[0])]
+    width, height = panel * shape[1], (panel / PANEL_ASPECT + 0.16) * shape[0]
     figure = Figure(figsize=(width, height), dpi=100, facecolor="white")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots(*shape, squeeze=False)
     figure.subplots_adjust(left=0.005, right=0.995, bottom=0.005, top=1.0 - 0.16 / height, wspace=0.02, hspace=0.1)
     for row, tasks in enumerate(columns):
         for column, name in enumerate(tasks):
-            _draw_pair(axes[2 * row, column], axes[2 * row + 1, column], load_task(name, registry=registry))
+            task = load_task(name, registry=registry)
+            _draw_pair(axes[2 * row, column], axes[2 * row + 1, column], task, width=int(110 * panel))
     _save(canvas, path)
     return path
 
 
-def _draw_pair(upper: Any, lower: Any, task: Task) -> None:
-    """Draw a task's start with its tools above, its target below."""
+def _draw_pair(upper: Any, lower: Any, task: Task, *, width: int) -> None:
+    """Draw a task's start with its tools above, its target below, each `width` pixels wide."""
     start, target = sample_particles(task.scene), task.load_target()
     pose = manipulator_pose(task.scene).numpy()
     tools = [tool_surface(tool, pose[index], rows=220, columns=320) for index, tool in enumerate(task.scene.manipulators)]
     view = _make_view(task, start, target, tools)
-    draw_scene(upper, view, start, clay_colours(view, start), tools, width=PANEL_WIDTH)
+    draw_scene(upper, view, start, clay_colours(view, start), tools, width=width)
     upper.set_title(f"{task.name}: start", fontsize=7, pad=1.5)
     view = dataclasses.replace(view, radius=_particle_radius(target))
-    draw_scene(lower, view, target, clay_colours(view, target), [], width=PANEL_WIDTH)
+    draw_scene(lower, view, target, clay_colours(view, target), [], width=width)
     lower.set_title("target", fontsize=7, pad=1.5)
 
 
