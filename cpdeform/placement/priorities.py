@@ -23,7 +23,8 @@ class Exploration:
         ranking: Bodies, that of the highest mean priority first.
         explored: Particles (N,) that are not proposed again.
         radius: Distance from a contact point within which particles count as explored, length units.
-        attempt: Number of contact points so far.
+        attempt: Number of contact points so far, those out of reach included.
+        rounds: Number of rounds of candidates so far.
     """
 
     stage: Stage
@@ -33,6 +34,7 @@ class Exploration:
     explored: Tensor
     radius: float
     attempt: int = 0
+    rounds: int = 0
 
     @classmethod
     def begin(cls, stage: Stage, *, radius: float) -> Exploration:

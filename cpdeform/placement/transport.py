@@ -21,6 +21,9 @@ from cpdeform.placement.touch import reduce_distances
 EXPLORED_RADIUS = 2.0
 """Distance from a contact point within which particles count as explored, in half widths of the narrowest tool."""
 
+MOST_CONTACTS = 60
+"""Contact points of a stage after which no further one is looked for."""
+
 CURRENT_DEPTH = 1e-3
 """How deep a tool that stays where it is may reach into the body, length units."""
 
@@ -115,11 +118,15 @@ class PlacerTransport(Placer):
             narrowest = min(_half_width(stage.scene.manipulators[index]) for index in movable)
             exploration = self._exploration = Exploration.begin(stage, radius=EXPLORED_RADIUS * narrowest)
         placements: list[Placement] = []
-        while not placements and exploration.attempt < self.attempts * self.contacts:
-            for _ in range(self.contacts):
-                # What depends on no contact point is proposed once.
-                placements += self._round(exploration, movable, first=exploration.attempt == 0)
-                exploration.attempt += 1
+        reached = 0
+        # A contact point that no tool can reach does not count as an attempt.
+        while reached < self.contacts and exploration.attempt < MOST_CONTACTS:
+            # What depends on no contact point is proposed once.
+            found = self._round(exploration, movable, first=exploration.attempt == 0)
+            exploration.attempt += 1
+            reached += bool(found)
+            placements += found
+        exploration.rounds += 1
         return placements
 
     def tell(self, results: list[PlacementResult]) -> bool:
@@ -129,7 +136,7 @@ class PlacerTransport(Placer):
             return False
         enough = (1.0 - self.least_gain) * exploration.stage.loss
         gained = any(result.loss < enough for result in results)
-        return not gained and exploration.attempt < self.attempts * self.contacts
+        return not gained and exploration.rounds < self.attempts
 
     def _round(self, exploration: Exploration, movable: Sequence[int], *, first: bool) -> list[Placement]:
         """Candidates around the next contact point, whose surroundings then count as explored."""

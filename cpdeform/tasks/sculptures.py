@@ -71,7 +71,7 @@ def star() -> Solid:
         outward = np.array([np.sin(angle), -np.cos(angle)])
         aside = np.array([np.cos(angle), np.sin(angle)])
         between = angle + np.pi / 5.0
-        corners = (tip * outward - half_tip * aside, tip * outward + half_tip * aside)
-        corners += (notch * np.array([np.sin(between), -np.cos(between)]),)
+        inward_corner = notch * np.array([np.sin(between), -np.cos(between)])
+        corners = (tip * outward - half_tip * aside, tip * outward + half_tip * aside, inward_corner)
         outline += [(0.5 + float(x), 0.5 + float(z)) for x, z in corners]
     return Solid(parts=(Prism(tuple(outline), floor, floor + thickness),), origin=(0.5, floor, 0.5), scaled_axes=(0, 2))

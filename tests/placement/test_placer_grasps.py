@@ -130,6 +130,15 @@ def test_explored_particles_are_not_proposed_again() -> None:
     assert not placer.tell(failed(placements, loss=0.5))
 
 
+def test_a_contact_point_out_of_reach_is_passed_over() -> None:
+    tools = [ManipulatorSphere(radius=0.03, position=(0.5, 0.6, 0.5), action_scale=SCALE, lower_bound=(0.0, 0.4, 0.0))]
+    stage = make_stage([block()], tools, (0.5, 0.35, 0.5))
+    (placement,) = PlacerTransport(attempts=1).ask(stage)
+    assert placement.contact_particle != int(stage.priorities.argmax())
+    assert float(placement.pose[0, 1]) >= 0.4
+    assert 0.0 <= gaps(stage, placement)[0] < 1e-3
+
+
 def test_current_and_apart() -> None:
     stage = make_stage([block(widths=(0.4, 0.06, 0.06))], balls((0.2, 0.4, 0.5), (0.8, 0.4, 0.5)), (0.65, 0.4, 0.5))
     current, apart = PlacerTransport(poses=["current", "apart"]).ask(stage)
