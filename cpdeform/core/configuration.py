@@ -58,6 +58,8 @@ class ObjectiveConfiguration(FrozenModel):
         refresh: Solve from scratch every so many evaluations, warm-started between.
         contact_weight: Weight of PlasticineLab's contact term, which draws tools to the body; where absent 0 for ``"transport"``
             and 1 for ``"plasticinelab"``.
+        coast_steps: (``"transport"``) Environment steps for which particles are taken to go on as fast as in the last one; see
+            `ObjectiveTransport`.
         contact: Kind of the contact term of ``"plasticinelab"``; see `cpdeform.core.objectives.contact.contact_loss`.
     """
 
@@ -66,6 +68,7 @@ class ObjectiveConfiguration(FrozenModel):
     blur: float = Field(default=2e-3, gt=0.0)
     refresh: int = Field(default=20, ge=1)
     contact_weight: float | None = Field(default=None, ge=0.0)
+    coast_steps: float = Field(default=0.0, ge=0.0)
     contact: ContactKind = "plasticinelab"
 
 

@@ -248,4 +248,5 @@ def make_objective(
         points=options.points,
         refresh=options.refresh,
         contact_weight=options.contact_weight or 0.0,
+        coast_steps=options.coast_steps,
     )

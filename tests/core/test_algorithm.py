@@ -8,12 +8,13 @@ import torch
 from cpdeform_toy.parts import OTSolverExactToy, OTSolverToy, PlacerFixedToy, PlacerToy
 from cpdeform_toy.simulator import SimulatorToy
 
-from cpdeform.core.algorithm import Planner
+from cpdeform.core.algorithm import Planner, failed_contacts
 from cpdeform.core.configuration import RunConfiguration
 from cpdeform.core.deform import deform, deform_configuration
 from cpdeform.core.errors import CapabilityError, InputError, UnknownNameError
 from cpdeform.core.objectives.transport import ObjectiveTransport
 from cpdeform.core.optimizer import TrajectoryOptimizer
+from cpdeform.core.placer import LEAST_GAIN
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.result import Observer, Status
 from cpdeform.core.task import load_task
@@ -86,9 +87,27 @@ def test_the_shape_is_judged_after_the_rest(make_toy_task):
     task = load_task(make_toy_task(step_count=3, rest_steps=2, stage_count=1))
     (stage,) = planner(task, iterations=3).run().stages
     assert stage.actions.shape == (5, 3)
-    assert stage.actions[:3].any() and not stage.actions[3:].any()
+    assert stage.actions[:3].any()
+    assert not stage.actions[3:].any()
     assert stage.positions.shape == (6, 60, 3)
     assert torch.equal(stage.positions[-1], stage.state.position[0])
+
+
+def test_contact_points_that_gain_nothing_are_passed_on(task):
+    class Spy(PlacerToy):
+        def ask(self, stage):
+            seen.append(stage.failed_contacts)
+            return [dataclasses.replace(item, contact_particle=10 * stage.index + n) for n, item in enumerate(super().ask(stage))]
+
+    seen = []
+    made = planner(task, placer=Spy(count=2, spacing=0.0, rounds=1), iterations=2)
+    result = made.run(stages=2)
+    gains = [1.0 - stage.loss / stage.loss_before for stage in result.stages]
+    assert seen == [(), () if gains[0] >= LEAST_GAIN else (0, 1)]
+    small = [dataclasses.replace(stage, loss=0.995 * stage.loss_before) for stage in result.stages]
+    assert failed_contacts(small) == (10, 11, 0, 1)
+    assert failed_contacts([small[0], dataclasses.replace(small[1], loss=0.9 * small[1].loss_before)]) == ()
+    assert failed_contacts([dataclasses.replace(small[0], loss=0.0), small[1]]) == (10, 11)
 
 
 def test_placers_may_ask_again(task):

@@ -14,6 +14,9 @@ from cpdeform.core.ot import OTResult, OTSolver
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import Trajectory
 
+COAST_SMOOTHING = 1e-5
+"""Distance per step, length units, below which the coasting term is smooth instead of proportional."""
+
 
 class ObjectiveTransport(Objective):
     """Transport cost of each world's final particles against the goal, optionally with PlasticineLab's contact term.
@@ -32,6 +35,9 @@ class ObjectiveTransport(Objective):
         refresh: Solve from scratch on each `refresh`-th call, since errors of warm starts accumulate; never where absent.
         contact_weight: Weight of the hard contact term, summed over the steps t = 1..T, cost units/length^2. It attracts
             tools that do not touch the body yet, from which the transport cost alone has no gradient.
+        coast_steps: Environment steps for which the particles are taken to go on as fast as in the last one. The loss then is the
+            cost plus the mean distance that they would go. For p = 1 this bounds the cost after these steps from above, so that a
+            shape which is right only in passing, at speed, is no minimum.
         scene: Whose tools the contact term is about; required with a `contact_weight`.
 
     Raises:
@@ -51,6 +57,7 @@ class ObjectiveTransport(Objective):
         warm_start: bool = True,
         refresh: int | None = None,
         contact_weight: float = 0.0,
+        coast_steps: float = 0.0,
         scene: Scene | None = None,
     ) -> None:
         if target.ndim != 2 or target.shape[1] != 3 or target.shape[0] == 0:
@@ -58,13 +65,14 @@ class ObjectiveTransport(Objective):
         for name, number in (("points", points), ("refresh", refresh)):
             if number is not None and number < 1:
                 raise InputError(name, came=str(number), expected="at least 1, or None")
-        if not 0.0 <= contact_weight < float("inf"):
-            raise InputError("contact_weight", came=str(contact_weight), expected="a finite number of at least 0")
+        for name, value in (("contact_weight", contact_weight), ("coast_steps", coast_steps)):
+            if not 0.0 <= value < float("inf"):
+                raise InputError(name, came=str(value), expected="a finite number of at least 0")
         if contact_weight > 0.0 and scene is None:
             raise InputError("scene", came="None", expected="the scene", remedy="The contact term needs the shapes of its tools.")
         self.solver, self.target, self.points, self.seed = solver, target.detach(), points, seed
         self.warm_start, self.refresh = warm_start and solver.capabilities.warm_start, refresh
-        self.contact_weight, self.scene = contact_weight, scene
+        self.contact_weight, self.coast_steps, self.scene = contact_weight, coast_steps, scene
         self._previous: list[OTResult] = []
         self._calls = 0
 
@@ -87,12 +95,27 @@ class ObjectiveTransport(Objective):
         loss, gradient = self._transport(positions[:, -1])
         grad_positions = torch.zeros_like(positions)
         grad_positions[:, -1] = gradient
+        if self.coast_steps > 0.0:
+            distance, slope = self._coast(positions)
+            loss = loss + distance
+            grad_positions[:, -1] += slope
+            grad_positions[:, -2] -= slope
         grad_poses = None
         if self.contact_weight > 0.0 and self.scene is not None:
             contact, contact_positions, grad_poses = self._contact(self.scene, positions, trajectory.manipulator_poses.detach())
             loss = loss + contact
             grad_positions += contact_positions
         return ObjectiveResult(loss=loss, grad_positions=grad_positions, grad_manipulators=grad_poses)
+
+    def _coast(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean distance (B,) that particles would still go, and its gradient (B, N, 3) at the last step.
+
+        At the step before that the gradient is the opposite.
+        """
+        step = positions[:, -1] - positions[:, -2]
+        length = (step.square().sum(dim=-1) + COAST_SMOOTHING**2).sqrt()
+        scale = self.coast_steps / positions.shape[2]
+        return scale * (length - COAST_SMOOTHING).sum(dim=-1), scale * step / length.unsqueeze(-1)
 
     def _transport(self, final: Tensor) -> tuple[Tensor, Tensor]:
         """Cost (B,) and gradient (B, N, 3) of final positions (B, N, 3)."""

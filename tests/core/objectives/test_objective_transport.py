@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
+from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
@@ -157,3 +160,34 @@ def test_options_are_checked() -> None:
         ObjectiveTransport(solver, goal(), contact_weight=1.0)
     with pytest.raises(InputError, match="target: got shape"):
         ObjectiveTransport(solver, torch.zeros(0, 3))
+
+
+def exact_distance(source: Tensor, target: Tensor) -> float:
+    """Wasserstein-1 distance of two clouds of equal size."""
+    cost = torch.cdist(source, target).numpy()
+    return float(cost[linear_sum_assignment(cost)].mean())
+
+
+def test_coasting_bounds_the_distance_later_and_has_the_right_gradient() -> None:
+    path, target, steps = trajectory(), goal(), 5.0
+    positions = path.positions.clone()
+    generator = torch.Generator().manual_seed(3)
+    positions[:, -1] = positions[:, -2] + 0.01 * torch.randn(positions[:, -1].shape, generator=generator, dtype=torch.float64)
+
+    def coast(moved: Tensor) -> tuple[Tensor, Tensor]:
+        moved_path = dataclasses.replace(path, positions=moved)
+        plain = ObjectiveTransport(OTSolverMean(), target).evaluate(moved_path)
+        coasting = ObjectiveTransport(OTSolverMean(), target, coast_steps=steps).evaluate(moved_path)
+        return coasting.loss - plain.loss, coasting.grad_positions - plain.grad_positions
+
+    distance, slope = coast(positions)
+    step = positions[:, -1] - positions[:, -2]
+    assert torch.allclose(distance, steps * step.norm(dim=-1).mean(dim=-1), rtol=1e-2)
+    for now, further, added in zip(positions[:, -1], step, distance, strict=True):
+        assert exact_distance(now + steps * further, target) <= exact_distance(now, target) + float(added) + 1e-4
+    direction = torch.randn(positions.shape, generator=generator, dtype=torch.float64)
+    numerical = (coast(positions + 1e-6 * direction)[0] - coast(positions - 1e-6 * direction)[0]) / 2e-6
+    assert torch.allclose((slope * direction).sum(dim=(1, 2, 3)), numerical, rtol=1e-5)
+    at_rest = positions.clone()
+    at_rest[:, -1] = at_rest[:, -2]
+    assert all(not part.any() for part in coast(at_rest))
