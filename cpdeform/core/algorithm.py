@@ -164,7 +164,7 @@ class Planner:
         seconds: dict[str, float] = {}
         clock = _Clock(seconds)
         self.objective.reset()
-        still = still_trajectory(state, self.task.rollout_steps, self.task.scene.action_size)
+        still = still_trajectory(state, self.task.rollout_steps, scene=self.task.scene)
         loss_before = float(self.objective.evaluate(still).loss[0])
         # "priorities f = optimal-transport potentials between current shape S_i and goal G"
         priorities = torch.full_like(state.position[0, :, 0], torch.nan)
@@ -297,13 +297,19 @@ def check_tools_outside(scene: Scene, state: State) -> None:
             )
 
 
-def still_trajectory(state: State, step_count: int, action_size: int) -> Trajectory:
-    """A trajectory of `step_count` steps during which nothing moves, to take the loss of a state."""
+def still_trajectory(state: State, step_count: int, *, scene: Scene) -> Trajectory:
+    """A trajectory of `step_count` steps during which nothing moves, to take the loss of a state.
+
+    Only its last step arrives with the velocity of the state, for an objective that asks whether the clay is at rest.
+    """
     worlds = state.batch_size
+    positions = state.position.unsqueeze(1).repeat(1, step_count + 1, 1, 1)
+    seconds = scene.time_step * scene.substeps
+    positions[:, -2] = (state.position - seconds * state.velocity).clamp(0.0, 1.0)
     return Trajectory(
-        positions=state.position.unsqueeze(1).expand(-1, step_count + 1, -1, -1),
+        positions=positions,
         manipulator_poses=state.manipulator_pose.unsqueeze(1).expand(-1, step_count + 1, -1, -1),
-        actions=torch.zeros(worlds, step_count, action_size, dtype=state.position.dtype, device=state.position.device),
+        actions=torch.zeros(worlds, step_count, scene.action_size, dtype=state.position.dtype, device=state.position.device),
         initial_state=state,
         final_state=state,
     )

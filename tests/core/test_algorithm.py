@@ -8,7 +8,7 @@ import torch
 from cpdeform_toy.parts import OTSolverExactToy, OTSolverToy, PlacerFixedToy, PlacerToy
 from cpdeform_toy.simulator import SimulatorToy
 
-from cpdeform.core.algorithm import Planner, failed_contacts
+from cpdeform.core.algorithm import Planner, failed_contacts, still_trajectory
 from cpdeform.core.configuration import RunConfiguration
 from cpdeform.core.deform import deform, deform_configuration
 from cpdeform.core.errors import CapabilityError, InputError, UnknownNameError
@@ -91,6 +91,17 @@ def test_the_shape_is_judged_after_the_rest(make_toy_task):
     assert not stage.actions[3:].any()
     assert stage.positions.shape == (6, 60, 3)
     assert torch.equal(stage.positions[-1], stage.state.position[0])
+
+
+def test_a_state_that_moves_on_is_not_taken_to_be_at_rest(task):
+    objective = ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), coast_steps=4.0)
+    state = SimulatorToy(task.scene, batch_size=1).initial_state(batch_size=1)
+    losses = [
+        float(objective.evaluate(still_trajectory(moving, 5, scene=task.scene)).loss)
+        for moving in (state, dataclasses.replace(state, velocity=torch.full_like(state.velocity, 3.0)))
+    ]
+    step = 3.0 * 3.0**0.5 * task.scene.time_step * task.scene.substeps
+    assert losses[1] - losses[0] == pytest.approx(4.0 * step, rel=1e-2)
 
 
 def test_contact_points_that_gain_nothing_are_passed_on(task):
