@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import enum
 import json
 import shlex
 import sys
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cpdeform.cli.bench_output import check_device, split_names, split_numbers
+from cpdeform.core.errors import InputError
 
 if TYPE_CHECKING:
     from cpdeform.core.plugins import Registry
@@ -21,109 +23,84 @@ if TYPE_CHECKING:
     from cpdeform.experiments.experiment_plan import ExperimentSettings, PlannedRun
     from cpdeform.experiments.experiment_row import ExperimentRow
 
-experiment = typer.Typer(no_args_is_help=True, help="Run the paper's experiments, with a record of each run and a table of all.")
 
-Tasks = Annotated[
-    str | None, typer.Option(help="Names or YAML files, separated by commas.  [default: all of the experiment]", metavar="NAMES")
-]
-Methods = Annotated[
-    str | None,
-    typer.Option(help="Of cpdeform, paper, fixed and random, separated by commas.  [default: cpdeform,fixed]", metavar="NAMES"),
-]
-Seeds = Annotated[str | None, typer.Option(help="Seeds, separated by commas.  [default: 0]", metavar="NUMBERS")]
-Iterations = Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: the task's, or 40]")]
-Stages = Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")]
-Particles = Annotated[
-    int | None, typer.Option(help="Particles of all bodies together; goals stay as they are.  [default: the task's]")
-]
-Targets = Annotated[
-    Path | None, typer.Option(help="Directory with a goal <task>.npz for every task, instead of their own.", metavar="DIR")
-]
-Backend = Annotated[str | None, typer.Option(help="Simulator; auto: the fastest installed.  [default: auto]", metavar="NAME")]
-Ot = Annotated[str | None, typer.Option(help="Optimal-transport solver.  [default: auto]", metavar="NAME")]
-Device = Annotated[str | None, typer.Option(help="cpu or cuda.  [default: cpu]", metavar="NAME")]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Any other option of `cpdeform run`, for all runs; repeatable.", metavar="KEY=VALUE"),
-]
-Equal = Annotated[
-    bool, typer.Option("--equal-evaluations", help="Give fixed as many gradient evaluations per stage as cpdeform used.")
-]
-PaperMetric = Annotated[bool, typer.Option("--paper-metric", help="Also take W1 with the paper's settings.")]
-Out = Annotated[
-    Path | None, typer.Option(help="Directory of records and tables.  [default: experiments/<experiment>]", metavar="DIR")
-]
-Resume = Annotated[
-    bool, typer.Option("--resume/--no-resume", help="Read runs that are recorded with the same configuration instead of running.")
-]
-NoRun = Annotated[
-    bool, typer.Option("--no-run", help="Run nothing; make the tables anew of all records in --out, or of those asked for.")
-]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line.")]
+class ExperimentName(enum.StrEnum):
+    """The experiments of the paper."""
+
+    MULTI_STAGE = "multi-stage"
+    SINGLE_STAGE = "single-stage"
 
 
-@experiment.command("multi-stage")
-def multi_stage_command(
-    tasks: Tasks = None,
-    methods: Methods = None,
-    seeds: Seeds = None,
-    iterations: Iterations = None,
-    stages: Stages = None,
-    particles: Particles = None,
-    targets: Targets = None,
-    backend: Backend = None,
-    ot: Ot = None,
-    device: Device = None,
-    settings: Settings = None,
-    equal_evaluations: Equal = False,
-    paper_metric: PaperMetric = False,
-    out: Out = None,
-    resume: Resume = True,
-    no_run: NoRun = False,
-    as_json: Json = False,
+def experiment(
+    name: Annotated[
+        ExperimentName,
+        typer.Argument(
+            help="multi-stage: judged by W1 to the goal; single-stage: by the normalised incremental IoU.", metavar="NAME"
+        ),
+    ],
+    tasks: Annotated[
+        str | None,
+        typer.Option(help="Names or YAML files, separated by commas.  [default: all of the experiment]", metavar="NAMES"),
+    ] = None,
+    variants: Annotated[
+        str | None,
+        typer.Option(help="(single-stage) Variants of tasks named without one.  [default: v1,v2,v3]", metavar="NAMES"),
+    ] = None,
+    methods: Annotated[
+        str | None,
+        typer.Option(help="Of cpdeform, paper, fixed and random, separated by commas.  [default: cpdeform,fixed]", metavar="NAMES"),
+    ] = None,
+    seeds: Annotated[str | None, typer.Option(help="Seeds, separated by commas.  [default: 0]", metavar="NUMBERS")] = None,
+    iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: the task's, or 40]")] = None,
+    stages: Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")] = None,
+    particles: Annotated[
+        int | None, typer.Option(help="Particles of all bodies together; goals stay as they are.  [default: the task's]")
+    ] = None,
+    targets: Annotated[
+        Path | None, typer.Option(help="Directory with a goal <task>.npz for every task, instead of their own.", metavar="DIR")
+    ] = None,
+    backend: Annotated[
+        str | None, typer.Option(help="Simulator; auto: the fastest installed.  [default: auto]", metavar="NAME")
+    ] = None,
+    ot: Annotated[str | None, typer.Option(help="Optimal-transport solver.  [default: auto]", metavar="NAME")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda.  [default: cpu]", metavar="NAME")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Any other option of `cpdeform run`, for all runs; repeatable.", metavar="KEY=VALUE"),
+    ] = None,
+    equal_evaluations: Annotated[
+        bool, typer.Option("--equal-evaluations", help="Give fixed as many gradient evaluations per stage as cpdeform used.")
+    ] = False,
+    paper_metric: Annotated[bool, typer.Option("--paper-metric", help="Also take W1 with the paper's settings.")] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="Directory of records and tables.  [default: experiments/<experiment>]", metavar="DIR")
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume/--no-resume", help="Read runs that are recorded with the same configuration instead of running."),
+    ] = True,
+    no_run: Annotated[
+        bool, typer.Option("--no-run", help="Run nothing; make the tables anew of all records in --out, or of those asked for.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line.")] = False,
 ) -> None:
-    """Run the multi-stage tasks, judged by W1 between the clay and its goal.
-
-    Exit code 0: there are figures; 1: no run has any; 2: unusable input; 130: interrupted (the table holds what was done).
-    """
-    _command("multi-stage", {**locals(), "variants": ""})
-
-
-@experiment.command("single-stage")
-def single_stage_command(
-    tasks: Tasks = None,
-    variants: Annotated[str, typer.Option(help="Variants of every task, separated by commas.", metavar="NAMES")] = "v1,v2,v3",
-    methods: Methods = None,
-    seeds: Seeds = None,
-    iterations: Iterations = None,
-    stages: Stages = None,
-    particles: Particles = None,
-    targets: Targets = None,
-    backend: Backend = None,
-    ot: Ot = None,
-    device: Device = None,
-    settings: Settings = None,
-    equal_evaluations: Equal = False,
-    paper_metric: PaperMetric = False,
-    out: Out = None,
-    resume: Resume = True,
-    no_run: NoRun = False,
-    as_json: Json = False,
-) -> None:
-    """Run PlasticineLab's single-stage tasks, judged by the normalised incremental IoU.
+    """Run one of the paper's experiments, with a record of each run and a table of all.
 
     A task's name with a variant, such as move-v4, or a YAML file is run as it is.
 
     Exit code 0: there are figures; 1: no run has any; 2: unusable input; 130: interrupted (the table holds what was done).
     """
-    _command("single-stage", locals())
+    given = locals()
+    if name is ExperimentName.MULTI_STAGE and variants is not None:
+        raise InputError("--variants", came=variants, expected="none with multi-stage", remedy="Its tasks have no variants.")
+    given["variants"] = "" if name is ExperimentName.MULTI_STAGE else variants or "v1,v2,v3"
+    _command(given.pop("name").value, given)
 
 
 def _command(name: str, given: dict[str, Any]) -> None:
     """Run an experiment, or only make its tables, and print the outcome."""
     from cpdeform.experiments.experiment_tables import write_tables
 
-    given = dict(given)
     as_json, no_run, resume = (given.pop(key) for key in ("as_json", "no_run", "resume"))
     given["out"] = given["out"] or Path("experiments") / name
     rows: list[ExperimentRow] = []

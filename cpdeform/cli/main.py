@@ -55,11 +55,11 @@ app = typer.Typer(
 app.command()(run)
 app.command()(evaluate)
 app.command()(tasks)
+app.command()(experiment)
 app.command()(plugins)
 app.add_typer(task, name="task")
 app.add_typer(bench, name="bench")
 app.add_typer(check, name="check")
-app.add_typer(experiment, name="experiment")
 
 
 def _show_version(wanted: bool) -> None:

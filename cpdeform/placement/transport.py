@@ -124,7 +124,7 @@ class PlacerTransport(Placer):
             # What depends on no contact point is proposed once.
             found = self._round(exploration, movable, first=exploration.attempt == 0)
             exploration.attempt += 1
-            reached += bool(found)
+            reached += any(placement.contact_particle is not None for placement in found)
             placements += found
         exploration.rounds += 1
         return placements

@@ -293,7 +293,7 @@ def test_variants_of_tasks():
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("target file /work/a b.npz: bad", "target file a b.npz: bad"),
+        ("target file /data/a b.npz: bad", "target file a b.npz: bad"),
         ("'/home/somebody/x/y.npz', got 1/2", "'y.npz', got 1/2"),
         ("relative/path.npz and https://example.org/a", "relative/path.npz and https://example.org/a"),
     ],

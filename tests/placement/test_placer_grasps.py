@@ -134,6 +134,9 @@ def test_a_contact_point_out_of_reach_is_passed_over() -> None:
     tools = [ManipulatorSphere(radius=0.03, position=(0.5, 0.6, 0.5), action_scale=SCALE, lower_bound=(0.0, 0.4, 0.0))]
     stage = make_stage([block()], tools, (0.5, 0.35, 0.5))
     (placement,) = PlacerTransport(attempts=1).ask(stage)
+    # nor do tools that stay where they are stand in for it
+    labels = [item.label for item in PlacerTransport(attempts=1, poses=["current", "direct"]).ask(stage)]
+    assert labels == ["current", "direct"]
     assert placement.contact_particle != int(stage.priorities.argmax())
     assert float(placement.pose[0, 1]) >= 0.4
     assert 0.0 <= gaps(stage, placement)[0] < 1e-3
