@@ -74,7 +74,6 @@ def run(
     """
     flags = (task, backend, ot, placer, device, seed, stages, steps, target, iterations)
     given = {field: value for field, value in zip(FLAGS, flags, strict=True) if value is not None}
-    from cpdeform.core.configuration import with_task_settings
     from cpdeform.core.deform import check_names, configured_task, resolved
     from cpdeform.core.plugins import load_registry
 
@@ -83,10 +82,9 @@ def run(
     if resume is not None:
         configuration, resumption = _resume(resume, given, settings or [], registry, out=out)
     check_names(configuration, registry=registry)
-    if resumption is None:
-        configuration = with_task_settings(configuration, configured_task(configuration, registry=registry))
+    task_asked = configured_task(configuration, registry=registry) if resumption is None else None
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
-        configuration = resolved(configuration, registry=registry)
+        configuration = resolved(configuration, registry=registry, task=task_asked)
         # Libraries print to stdout, too; a reader of the JSON must not see that.
         result, directory = _execute(configuration, resumption, registry, out, overwrite=overwrite, silent=as_json)
         picture = None if no_pictures else _draw(directory)

@@ -20,9 +20,9 @@ PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType({"optimizer": {"schedule": 
 """What ``algorithm=paper`` sets where the user does not: Algorithm 1 to the letter."""
 
 PAPER_PLACER_OPTIONS: Mapping[str, Any] = MappingProxyType(
-    {"distance_scale": 1.0, "max_gap": None, "poses": ("left-right", "top-bottom", "front-back"), "attempts": 1, "least_gain": 0.0}
+    {"distance_scale": 1.0, "max_gap": None, "poses": None, "attempts": 1, "least_gain": 0.0}
 )
-"""Options of the placer ``transport`` with ``algorithm=paper``."""
+"""Options of the placer ``transport`` with ``algorithm=paper``; poses: the placer's own, by the number of tools."""
 
 
 class OptimizerConfiguration(FrozenModel):

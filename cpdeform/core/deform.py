@@ -132,12 +132,8 @@ def deform_configuration(
     """
     registry = registry or load_registry()
     check_names(configuration, registry=registry)
-    if resumption is None:
-        task = configured_task(configuration, registry=registry)
-        configuration = with_task_settings(configuration, task)
-    else:
-        task = resumption.task
-    configuration = resolved(configuration, registry=registry)
+    task = configured_task(configuration, registry=registry) if resumption is None else resumption.task
+    configuration = resolved(configuration, registry=registry, task=task if resumption is None else None)
     placer = registry.create("placer", configuration.placer, **configuration.placer_options)
     simulator_options = {"batch_size": MAX_WORLDS, **configuration.simulator_options}
     simulator = registry.create(
@@ -167,13 +163,21 @@ def deform_configuration(
     )
 
 
-def resolved(configuration: RunConfiguration, *, registry: Registry) -> RunConfiguration:
-    """The configuration with the names that ``"auto"`` stands for in its place.
+def resolved(configuration: RunConfiguration, *, registry: Registry, task: Task | None = None) -> RunConfiguration:
+    """The configuration with all that the user left open: names in the place of ``"auto"``, and the task's settings.
+
+    Args:
+        configuration: What the user set.
+        registry: Where names are looked up.
+        task: The task whose settings count; None where a record's configuration holds them already.
 
     Raises:
+        InputError: The task's settings do not fit.
         UnknownNameError: No plugin registers one of the names.
         PluginError: Nothing is installed that ``"auto"`` could stand for.
     """
+    if task is not None:
+        configuration = with_task_settings(configuration, task)
     device = configuration.device
     names = {
         "backend": registry.resolve("simulator", configuration.backend, device=device),

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
 from cpdeform.core.configuration import PAPER_PLACER_OPTIONS, RunConfiguration, with_task_settings
 from cpdeform.core.errors import InputError
-from cpdeform.core.task import load_task
+from cpdeform.core.placer import Stage
+from cpdeform.core.plugins import load_registry
+from cpdeform.core.state import initial_state
+from cpdeform.core.task import changed_task, load_task
 
 
 @pytest.fixture
@@ -47,3 +51,19 @@ def test_unknown_settings_of_a_task_are_named(make_toy_task):
     task = load_task(make_toy_task(settings={"optimizer": {"iteration": 3}}))
     with pytest.raises(InputError, match=r"task shift: settings.*iteration.*iterations"):
         with_task_settings(RunConfiguration(), task)
+
+
+def test_the_papers_poses_follow_the_number_of_tools() -> None:
+    """A single tool is placed by the score alone, however many poses the task's own settings name."""
+    registry = load_registry()
+    labels = {}
+    for name in ("torus", "airplane"):
+        task = load_task(name)
+        few = {"bodies": {"0": {"particle_count": 500}}}
+        task = changed_task(task, scene=few)
+        options = with_task_settings(RunConfiguration(algorithm="paper"), task).placer_options
+        state = initial_state(task.scene, dtype=torch.float64)
+        priorities = state.position[0, :, 1].clone()
+        stage = Stage(0, task.scene, state, state.position[0], priorities, torch.Generator())
+        labels[name] = [placement.label for placement in registry.create("placer", "transport", **options).ask(stage)]
+    assert labels == {"torus": ["direct"], "airplane": ["left-right", "top-bottom", "front-back"]}
