@@ -249,6 +249,9 @@ class Scene(FrozenModel):
         time_step: Seconds per substep.
         substeps: Substeps per environment step.
         softness: Decay rate of a tool's influence outside its surface, 1/length; 0 gives a hard boundary.
+        sampling: ``"uniform"``, or ``"plasticinelab"`` for the very particles of PlasticineLab (with a seed of 0). Its published
+            target grids are made of them: each holds the random density of that sample, without which the soft IoU with such
+            a grid stays far below 1 even for the right shape.
         sampling_seed: Seed of the particle positions inside the bodies.
     """
 
@@ -263,7 +266,8 @@ class Scene(FrozenModel):
     time_step: PositiveFloat = 1e-4
     substeps: int = Field(default=19, ge=1)
     softness: NonNegativeFloat = 666.0
-    sampling_seed: int = Field(default=0, ge=0)
+    sampling: Literal["uniform", "plasticinelab"] = "uniform"
+    sampling_seed: int = Field(default=0, ge=0, le=2**32 - 1)
 
     @model_validator(mode="after")
     def _check_bodies_inside(self) -> Scene:

@@ -2,14 +2,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from cpdeform.core.sampling import body_index, sample_particles
-from cpdeform.core.scene import BodyBox, BodySphere, ManipulatorBox, ManipulatorCapsule, Material, Scene
+from cpdeform.core.scene import ManipulatorBox, ManipulatorCapsule, Material, Scene
 from cpdeform.core.state import initial_state
 
 BALL = {"kind": "sphere", "position": (0.5, 0.5, 0.5), "radius": 0.1, "particle_count": 500}
@@ -68,24 +64,6 @@ def test_scenes_are_immutable():
     scene = Scene(bodies=(BALL,))
     with pytest.raises(ValidationError, match="frozen"):
         scene.grid_size = 32
-
-
-@given(
-    position=st.tuples(*[st.floats(0.3, 0.6)] * 3),
-    widths=st.tuples(*[st.floats(0.01, 0.4)] * 3),
-    radius=st.floats(0.01, 0.2),
-    seed=st.integers(0, 1000),
-)
-def test_particles_fill_their_bodies(position, widths, radius, seed):
-    block = BodyBox(position=position, widths=widths, particle_count=50)
-    ball = BodySphere(position=position, radius=radius, particle_count=30)
-    scene = Scene(bodies=(block, ball), sampling_seed=seed)
-    particles = sample_particles(scene)
-    assert particles.shape == (80, 3)
-    assert (np.abs(particles[:50] - position) <= np.asarray(block.half_extents) + 1e-12).all()
-    assert (np.linalg.norm(particles[50:] - position, axis=1) <= radius + 1e-12).all()
-    np.testing.assert_array_equal(particles, sample_particles(scene))
-    assert body_index(scene).tolist() == [0] * 50 + [1] * 30
 
 
 def test_initial_state():
