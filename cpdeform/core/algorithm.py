@@ -163,9 +163,8 @@ class Planner:
         """One stage: priorities, placements, plans, execution of the best."""
         seconds: dict[str, float] = {}
         clock = _Clock(seconds)
-        self.objective.reset()
         still = still_trajectory(state, self.task.rollout_steps, scene=self.task.scene)
-        loss_before = float(self.objective.evaluate(still).loss[0])
+        loss_before = float(self.objective.begin(still).loss[0])
         # "priorities f = optimal-transport potentials between current shape S_i and goal G"
         priorities = torch.full_like(state.position[0, :, 0], torch.nan)
         if self.placer.capabilities.needs_priorities:
@@ -196,6 +195,9 @@ class Planner:
         trajectory, loss = None, loss_before
         if status is Status.FINISHED and best is not None:
             trajectory, loss = self._execute(state, candidates[best])
+            # A warm-started loss may flatter its plan.
+            if not loss < loss_before:
+                trajectory, loss, status = None, loss_before, Status.NO_IMPROVEMENT
         clock.lap("execution")
         seconds["total"] = clock.total()
         finished = trajectory is not None
@@ -257,8 +259,7 @@ class Planner:
         """Run the chosen plan once more, as a single world, and take its loss by a fresh (not warm-started) evaluation."""
         start = state.with_manipulators(candidate.placement.pose.unsqueeze(0))
         trajectory = self.simulator.rollout(start, candidate.actions.unsqueeze(0))
-        self.objective.reset()
-        return trajectory, float(self.objective.evaluate(trajectory).loss[0])
+        return trajectory, float(self.objective.begin(trajectory).loss[0])
 
 
 def stage_generator(seed: int, index: int) -> torch.Generator:

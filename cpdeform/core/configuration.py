@@ -66,7 +66,7 @@ class ObjectiveConfiguration(FrozenModel):
     kind: Literal["transport", "plasticinelab"] = "transport"
     points: int | None = Field(default=2000, ge=1)
     blur: float = Field(default=2e-3, gt=0.0)
-    refresh: int = Field(default=20, ge=1)
+    refresh: int = Field(default=50, ge=1)
     contact_weight: float | None = Field(default=None, ge=0.0)
     coast_steps: float = Field(default=0.0, ge=0.0)
     contact: ContactKind = "plasticinelab"

@@ -34,8 +34,18 @@ class Objective(abc.ABC):
     def evaluate(self, trajectory: Trajectory) -> ObjectiveResult:
         """Loss and gradient of each world of a trajectory."""
 
+    def begin(self, start: Trajectory) -> ObjectiveResult:
+        """Forget all calls before, and evaluate where a stage begins.
+
+        Args:
+            start: A single world, evaluated without a warm start. All worlds of the stage begin near its last positions, so that
+                what is found here may serve them all as a warm start.
+        """
+        self.reset()
+        return self.evaluate(start)
+
     def reset(self) -> None:  # noqa: B027 - most objectives keep nothing
-        """Forget what was kept between calls (warm starts); called when a stage begins."""
+        """Forget what was kept between calls (warm starts) since `begin`; called before each batch of worlds."""
 
     def keep(self, worlds: Sequence[int]) -> None:  # noqa: B027 - most objectives keep nothing
         """From now on a batch holds just these worlds of the previous one, in this order; for warm starts."""

@@ -31,7 +31,7 @@ class ObjectiveTransport(Objective):
             of fewer particles is used whole. Clouds of equal size share the subset, so that particles that correspond stay
             together.
         seed: Seed of the subset.
-        warm_start: Whether to start from the previous call's solution.
+        warm_start: Whether to start from the previous call's solution, and the first call after `begin` from that of the start.
         refresh: Solve from scratch on each `refresh`-th call, since errors of warm starts accumulate; never where absent.
         contact_weight: Weight of the hard contact term, summed over the steps t = 1..T, cost units/length^2. It attracts
             tools that do not touch the body yet, from which the transport cost alone has no gradient.
@@ -74,10 +74,20 @@ class ObjectiveTransport(Objective):
         self.warm_start, self.refresh = warm_start and solver.capabilities.warm_start, refresh
         self.contact_weight, self.coast_steps, self.scene = contact_weight, coast_steps, scene
         self._previous: list[OTResult] = []
+        self._start: OTResult | None = None
         self._calls = 0
 
+    def begin(self, start: Trajectory) -> ObjectiveResult:
+        """Evaluate a single world from scratch; its solution is where the first evaluation of each batch starts from."""
+        self._start = None
+        self.reset()
+        result = self.evaluate(start)
+        self._start = self._previous[0] if self._previous else None
+        self.reset()
+        return result
+
     def reset(self) -> None:
-        """Forget the solutions kept for warm starts."""
+        """Forget the solutions kept for warm starts, but that of the stage's start."""
         self._previous = []
         self._calls = 0
 
@@ -122,11 +132,13 @@ class ObjectiveTransport(Objective):
         source_index, target_index = self._subsets(final.shape[1])
         target = self.target.to(final)[target_index.to(final.device)]
         source_index = source_index.to(final.device)
-        cold = self.refresh is not None and self._calls % self.refresh == 0
+        cold = self.refresh is not None and self._calls > 0 and self._calls % self.refresh == 0
         previous: list[OTResult | None] = [None] * final.shape[0]
         # A call with another number of worlds is another batch of plans: which world was which is unknown.
         if self.warm_start and not cold and len(self._previous) == final.shape[0]:
             previous = list(self._previous)
+        elif self.warm_start and self._calls == 0:
+            previous = [self._start] * final.shape[0]
         results = [
             self.solver.solve(cloud[source_index], target, previous=start) for cloud, start in zip(final, previous, strict=True)
         ]

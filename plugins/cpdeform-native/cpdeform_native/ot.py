@@ -118,8 +118,8 @@ class OTSolverNative(OTSolver):
         scaling: float = 0.5,
         tolerance: float = 1e-4,
         iterations: int = 3000,
-        warm_iterations: int = 20,
-        warm_tolerance: float = 7.5e-3,
+        warm_iterations: int = 40,
+        warm_tolerance: float = 3e-3,
         threads: int | None = None,
         instruction_set: str | None = None,
     ) -> None:

@@ -130,6 +130,23 @@ def test_warm_starts_refresh_and_reset() -> None:
     assert solver.warm == [False, True, True, False, True, False]
 
 
+def test_every_batch_starts_from_the_solution_of_the_stages_start() -> None:
+    solver = OTSolverMean()
+    objective = ObjectiveTransport(solver, goal(), refresh=2)
+    objective.evaluate(trajectory(worlds=1))
+    start = float(objective.begin(trajectory(worlds=1)).loss[0])
+    for _ in range(2):
+        objective.reset()
+        objective.evaluate(trajectory())
+    assert solver.warm == [False, False, True, True, True, True]
+    assert all(call[2] is not None and float(call[2].value) == start for call in solver.calls[2:])
+    objective.evaluate(trajectory())
+    objective.evaluate(trajectory())
+    assert solver.warm[6:] == [True, True, False, False]
+    objective.begin(trajectory(worlds=1))
+    assert not solver.warm[-1]
+
+
 def test_every_world_starts_from_its_own_solution() -> None:
     solver = OTSolverMean()
     objective = ObjectiveTransport(solver, goal())
