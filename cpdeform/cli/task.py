@@ -48,6 +48,7 @@ def import_grid_command(
         if value is not None:
             raise InputError(flag, came=str(value), expected="nothing with --all", remedy="Import that grid alone, without --all.")
     import_grids(file, out, seed=seed, overwrite=overwrite, on_imported=_show)
+    typer.echo(_SAMPLING)
 
 
 def _import_one(
@@ -67,8 +68,13 @@ def _import_one(
     found = load_task(task)
     check_output(out, overwrite=overwrite)
     _show(import_grid(grids[name], found, name=name, path=out, particles=particles, seed=seed))
+    typer.echo(_SAMPLING)
 
 
+_SAMPLING = (
+    "A grid that PlasticineLab simulated holds the random density of its own particles; "
+    "run these goals with --set scene.sampling=plasticinelab."
+)
 _TASKS = "`cpdeform tasks` lists them."
 
 

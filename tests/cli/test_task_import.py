@@ -57,6 +57,7 @@ def test_particles_have_the_masses_of_the_grid(directory, grid):
     result = invoke("grid.npy", "--task", "shift.yaml", "--out", "goals/goal.npz")
     assert result.exit_code == 0, result.output
     assert "goals/goal.npz: grid for shift, 800 particles, error of the node masses" in result.stdout
+    assert "--set scene.sampling=plasticinelab" in result.stdout
     goal = directory / "goals" / "goal.npz"
     position, kept = load_target(goal, scene=scene), load_target_grid(goal, scene=scene)
     assert position.shape == (COUNT, 3)
