@@ -119,7 +119,7 @@ class OTSolverNative(OTSolver):
         tolerance: float = 1e-4,
         iterations: int = 3000,
         warm_iterations: int = 40,
-        warm_tolerance: float = 3e-3,
+        warm_tolerance: float = 5e-3,
         threads: int | None = None,
         instruction_set: str | None = None,
     ) -> None:
