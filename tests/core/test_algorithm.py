@@ -12,6 +12,7 @@ from cpdeform.core.algorithm import Planner, failed_contacts, still_trajectory
 from cpdeform.core.configuration import RunConfiguration
 from cpdeform.core.deform import deform, deform_configuration
 from cpdeform.core.errors import CapabilityError, InputError, UnknownNameError
+from cpdeform.core.objective import Objective, ObjectiveResult
 from cpdeform.core.objectives.transport import ObjectiveTransport
 from cpdeform.core.optimizer import TrajectoryOptimizer
 from cpdeform.core.placer import LEAST_GAIN
@@ -143,6 +144,22 @@ def test_statuses_are_data_with_advice(task):
         assert result.loss_final == result.loss_initial == stage.loss
         assert math.isfinite(result.metric_value)
     assert Status.FINISHED.advice == ""
+
+
+def test_a_plan_that_only_a_warm_start_flatters_is_not_executed(task):
+    class Flattering(Objective):
+        def begin(self, start):
+            return dataclasses.replace(self.evaluate(start), loss=torch.ones(1))
+
+        def evaluate(self, trajectory):
+            positions = trajectory.positions
+            return ObjectiveResult(loss=torch.full((len(positions),), 0.5), grad_positions=torch.zeros_like(positions))
+
+    made = dataclasses.replace(planner(task, iterations=2), objective=Flattering())
+    (stage,) = made.run(stages=1).stages
+    assert {candidate.loss for candidate in stage.candidates} == {0.5}
+    assert (stage.status, stage.best, stage.actions, stage.loss) == (Status.NO_IMPROVEMENT, None, None, 1.0)
+    assert torch.equal(stage.state.position, stage.state_before.position)
 
 
 def test_what_came_before_a_failed_stage_is_kept(task):
