@@ -44,3 +44,22 @@ def body_index(scene: Scene) -> NDArray[np.int32]:
     """Index (N,) of the body that each particle belongs to."""
     counts = [body.particle_count for body in scene.bodies]
     return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+
+
+def solid_index(scene: Scene) -> NDArray[np.int32]:
+    """Index (N,) of the solid that each particle belongs to at the scene's start.
+
+    Bodies with particles nearer to each other than a grid cell are one solid: they share grid nodes, so that the simulator joins them.
+    """
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    bodies = body_index(scene)
+    positions = sample_particles(scene)
+    trees = [KDTree(positions[bodies == body]) for body in range(len(scene.bodies))]
+    joined = np.eye(len(trees), dtype=np.int8)
+    for first, tree in enumerate(trees):
+        for second in range(first):
+            joined[first, second] = tree.count_neighbors(trees[second], 1.0 / scene.grid_size) > 0
+    _, labels = connected_components(joined, directed=False)
+    return np.asarray(labels, dtype=np.int32)[bodies]

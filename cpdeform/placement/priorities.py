@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Stage
-from cpdeform.core.sampling import body_index
+from cpdeform.core.sampling import solid_index
 
 
 @dataclasses.dataclass
@@ -19,7 +19,7 @@ class Exploration:
     Attributes:
         stage: The stage.
         priorities: Its priorities (N,), checked, in the type of the positions.
-        bodies: Index (N,) of each particle's body.
+        bodies: Index (N,) of each particle's body; bodies that touch at the scene's start are one.
         ranking: Bodies, that of the highest mean priority first.
         explored: Particles (N,) that are not proposed again.
         radius: Distance from a contact point within which particles count as explored, length units.
@@ -55,8 +55,8 @@ class Exploration:
                 came=f"shape {tuple(priorities.shape)}, {int((~torch.isfinite(priorities)).sum())} not finite",
                 expected=f"{particles.shape[0]} finite priorities",
             )
-        bodies = torch.as_tensor(body_index(stage.scene)).to(particles.device).long()
-        count = len(stage.scene.bodies)
+        bodies = torch.as_tensor(solid_index(stage.scene)).to(particles.device).long()
+        count = int(bodies.max()) + 1
         sums = torch.zeros(count, dtype=torch.float64, device=particles.device).index_add(0, bodies, priorities.double())
         means = sums / torch.bincount(bodies, minlength=count)
         ranking = means.argsort(descending=True, stable=True).tolist()

@@ -8,7 +8,7 @@ from golden import NAMES, golden_path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpdeform.core.sampling import body_index, sample_particles
+from cpdeform.core.sampling import body_index, sample_particles, solid_index
 from cpdeform.core.scene import BodyBox, BodySphere, Scene
 from cpdeform.core.task import load_task
 
@@ -38,6 +38,16 @@ def test_particles_fill_their_bodies(position, widths, radius, seed, sampling):
     assert (np.linalg.norm(particles[50:] - position, axis=1) <= radius + 1e-12).all()
     np.testing.assert_array_equal(particles, sample_particles(scene))
     assert body_index(scene).tolist() == [0] * 50 + [1] * 30
+
+
+def test_bodies_that_share_grid_nodes_are_one_solid():
+    positions = {"leg": (0.3, 0.1, 0.3), "top": (0.4, 0.17, 0.4), "far leg": (0.5, 0.1, 0.5), "apart": (0.8, 0.1, 0.8)}
+    widths = {"leg": (0.04, 0.1, 0.04), "top": (0.3, 0.04, 0.3), "far leg": (0.04, 0.1, 0.04), "apart": (0.04, 0.1, 0.04)}
+    bodies = tuple(BodyBox(position=positions[name], widths=widths[name], particle_count=500) for name in positions)
+    assert solid_index(Scene(bodies=bodies)).tolist() == [0] * 1500 + [1] * 500
+    # The top of the same table on a grid so fine that its gap to the legs, about 0.005, is many cells wide.
+    raised = bodies[1].model_copy(update={"position": (0.4, 0.175, 0.4)})
+    assert len(set(solid_index(Scene(bodies=(bodies[0], raised, *bodies[2:]), grid_size=512)).tolist())) == 4
 
 
 @pytest.mark.parametrize("sampling", ["uniform", "plasticinelab"])

@@ -126,3 +126,18 @@ def test_unusable_inputs_are_named() -> None:
         PlacerTransport(distance_scale=0.0)
     with pytest.raises(CapabilityError, match="no movable tool"):
         PlacerTransport().ask(board(100, action_scale=()))
+
+
+def test_bodies_that_touch_are_ranked_as_one() -> None:
+    """A table's leg that has to move comes first, though the mean over the leg's box is below that of the top."""
+    leg = BodyBox(position=(0.45, 0.1, 0.5), widths=(0.04, 0.1, 0.04), particle_count=1000)
+    top = BodyBox(position=(0.55, 0.17, 0.5), widths=(0.3, 0.04, 0.2), particle_count=1000)
+    scene = Scene(bodies=(leg, top), manipulators=board().scene.manipulators)
+    state = initial_state(scene)
+    x, y, _ = state.position[0].unbind(-1)
+    tip = (x < 0.45) & (y < 0.08)
+    priorities = torch.where(y > 0.15, 0.005, torch.where(tip, 0.02, -0.01))
+    assert priorities[:1000].mean() < priorities[1000:].mean()
+    stage = Stage(0, scene, state, state.position[0], priorities, torch.Generator().manual_seed(0))
+    placements = PlacerTransport(distance_scale=0.01, max_gap=0.005).ask(stage)
+    assert [bool(tip[placement.contact_particle]) for placement in placements] == [True]
