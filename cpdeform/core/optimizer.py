@@ -72,6 +72,7 @@ class TrajectoryOptimizer:
     Attributes:
         iterations: The most gradient evaluations per world.
         learning_rate: Adam's step size, in units of action.
+        learning_rate_decay: Share of it that is left at the last of the `iterations`, reached along half a cosine [2]_; 1 keeps it.
         patience: Stop when no world improved by `tolerance` for this many iterations.
         tolerance: Smallest relative improvement of the loss that counts.
         initial_noise: Standard deviation of the first actions about zero, so that seeds differ.
@@ -80,10 +81,12 @@ class TrajectoryOptimizer:
 
     References:
         .. [1] Jamieson, Talwalkar, "Non-stochastic Best Arm Identification and Hyperparameter Optimization", AISTATS 2016.
+        .. [2] Loshchilov, Hutter, "SGDR: Stochastic Gradient Descent with Warm Restarts", ICLR 2017, equation 5.
     """
 
     iterations: int = 40
     learning_rate: float = 0.1
+    learning_rate_decay: float = 1.0
     patience: int = 15
     tolerance: float = 1e-3
     initial_noise: float = 0.01
@@ -94,6 +97,8 @@ class TrajectoryOptimizer:
         for name, fine in limits.items():
             if not fine:
                 raise InputError(f"optimizer.{name}", came=str(getattr(self, name)), expected="a positive number")
+        if not 0.0 < self.learning_rate_decay <= 1.0:
+            raise InputError("optimizer.learning_rate_decay", came=str(self.learning_rate_decay), expected="above 0 and at most 1")
         for name in ("tolerance", "initial_noise"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"optimizer.{name}", came=str(getattr(self, name)), expected="zero or more")
@@ -151,6 +156,7 @@ class TrajectoryOptimizer:
             best_loss = torch.where(better, loss, best_loss)
             best_actions[better.to(best_actions.device)] = tried.detach()[better.to(tried.device)]
             start = time.perf_counter()
+            adam.param_groups[0]["lr"] = self._step_size(index)
             going = torch.zeros_like(finite)
             going[active] = finite[active]
             _step(adam, tried, gradient, active, going, best_actions)
@@ -169,6 +175,12 @@ class TrajectoryOptimizer:
                 objective.keep([active.tolist().index(world) for world in survivors.tolist()])
                 active = survivors
         return OptimizationResult(best_actions, best_loss, finite, evaluations, tuple(history))
+
+    def _step_size(self, index: int) -> float:
+        """Adam's step size after the iteration with the given number."""
+        share = index / max(1, self.iterations - 1)
+        lowest = self.learning_rate_decay
+        return self.learning_rate * (lowest + 0.5 * (1.0 - lowest) * (1.0 + math.cos(math.pi * share)))
 
     def _survivors(self, active: Tensor, best_loss: Tensor, done: int) -> Tensor:
         """Which worlds go on after `done` iterations, in order."""

@@ -49,7 +49,7 @@ def body_index(scene: Scene) -> NDArray[np.int32]:
 def solid_index(scene: Scene) -> NDArray[np.int32]:
     """Index (N,) of the solid that each particle belongs to at the scene's start.
 
-    Bodies with particles nearer to each other than a grid cell are one solid: they share grid nodes, so that the simulator joins them.
+    Bodies with particles nearer to each other than a grid cell are one: they share grid nodes, so that the simulator joins them.
     """
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree

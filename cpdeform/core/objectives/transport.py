@@ -75,14 +75,21 @@ class ObjectiveTransport(Objective):
         self.contact_weight, self.coast_steps, self.scene = contact_weight, coast_steps, scene
         self._previous: list[OTResult] = []
         self._start: OTResult | None = None
+        self._start_cloud: Tensor | None = None
         self._calls = 0
 
     def begin(self, start: Trajectory) -> ObjectiveResult:
-        """Evaluate a single world from scratch; its solution is where the first evaluation of each batch starts from."""
-        self._start = None
+        """Evaluate a single world from scratch; its solution is where the first evaluation of each batch starts from.
+
+        Where the call before was about the same particles, as at the end of a stage and the beginning of the next, its solution is
+        taken again.
+        """
+        cloud = start.positions[0, -1].detach()
+        known = self._start_cloud is not None and torch.equal(cloud, self._start_cloud)
+        previous, self._start = self._start if known else None, None
         self.reset()
-        result = self.evaluate(start)
-        self._start = self._previous[0] if self._previous else None
+        result = self._evaluate(start, None if previous is None else [previous])
+        self._start, self._start_cloud = (self._previous[0], cloud.clone()) if self._previous else (None, None)
         self.reset()
         return result
 
@@ -101,8 +108,12 @@ class ObjectiveTransport(Objective):
         Raises:
             InputError: A final position is not finite.
         """
+        return self._evaluate(trajectory, None)
+
+    def _evaluate(self, trajectory: Trajectory, solutions: list[OTResult] | None) -> ObjectiveResult:
+        """As `evaluate`, with the transport problems' solutions where they are known."""
         positions = trajectory.positions.detach()
-        loss, gradient = self._transport(positions[:, -1])
+        loss, gradient = self._transport(positions[:, -1], solutions)
         grad_positions = torch.zeros_like(positions)
         grad_positions[:, -1] = gradient
         if self.coast_steps > 0.0:
@@ -127,27 +138,27 @@ class ObjectiveTransport(Objective):
         scale = self.coast_steps / positions.shape[2]
         return scale * (length - COAST_SMOOTHING).sum(dim=-1), scale * step / length.unsqueeze(-1)
 
-    def _transport(self, final: Tensor) -> tuple[Tensor, Tensor]:
+    def _transport(self, final: Tensor, solutions: list[OTResult] | None) -> tuple[Tensor, Tensor]:
         """Cost (B,) and gradient (B, N, 3) of final positions (B, N, 3)."""
-        source_index, target_index = self._subsets(final.shape[1])
-        target = self.target.to(final)[target_index.to(final.device)]
-        source_index = source_index.to(final.device)
-        cold = self.refresh is not None and self._calls > 0 and self._calls % self.refresh == 0
-        previous: list[OTResult | None] = [None] * final.shape[0]
-        # A call with another number of worlds is another batch of plans: which world was which is unknown.
-        if self.warm_start and not cold and len(self._previous) == final.shape[0]:
-            previous = list(self._previous)
-        elif self.warm_start and self._calls == 0:
-            previous = [self._start] * final.shape[0]
-        results = [
-            self.solver.solve(cloud[source_index], target, previous=start) for cloud, start in zip(final, previous, strict=True)
-        ]
+        source_index, target_index = (index.to(final.device) for index in self._subsets(final.shape[1]))
+        results = self._solve(final[:, source_index], self.target.to(final)[target_index]) if solutions is None else solutions
         self._previous = results if self.warm_start else []
         self._calls += 1
         gradient = torch.zeros_like(final)
         for world, result in enumerate(results):
             gradient[world, source_index] = result.source_gradient.to(final)
         return torch.stack([result.value.to(final) for result in results]), gradient
+
+    def _solve(self, clouds: Tensor, target: Tensor) -> list[OTResult]:
+        """Solutions of clouds (B, n, 3) against the target (m, 3), warm-started where that may be."""
+        cold = self.refresh is not None and self._calls > 0 and self._calls % self.refresh == 0
+        previous: list[OTResult | None] = [None] * len(clouds)
+        # A call with another number of worlds is another batch of plans: which world was which is unknown.
+        if self.warm_start and not cold and len(self._previous) == len(clouds):
+            previous = list(self._previous)
+        elif self.warm_start and self._calls == 0:
+            previous = [self._start] * len(clouds)
+        return [self.solver.solve(cloud, target, previous=start) for cloud, start in zip(clouds, previous, strict=True)]
 
     def _subsets(self, source_count: int) -> tuple[Tensor, Tensor]:
         """Sorted indices of the source and the target particles that the problem is solved on."""

@@ -143,8 +143,28 @@ def test_every_batch_starts_from_the_solution_of_the_stages_start() -> None:
     objective.evaluate(trajectory())
     objective.evaluate(trajectory())
     assert solver.warm[6:] == [True, True, False, False]
-    objective.begin(trajectory(worlds=1))
-    assert not solver.warm[-1]
+    assert len(solver.calls) == 10
+    elsewhere = trajectory(worlds=1)
+    objective.begin(dataclasses.replace(elsewhere, positions=elsewhere.positions + 0.01))
+    assert solver.warm[10:] == [False]
+
+
+def test_a_start_that_is_known_is_not_solved_again() -> None:
+    """A stage begins with the particles that the one before ended with."""
+    solver, path = OTSolverMean(), trajectory(worlds=1)
+    objective = ObjectiveTransport(solver, goal(), coast_steps=2.0)
+    first = objective.begin(path)
+    objective.evaluate(trajectory())
+    still = dataclasses.replace(path, positions=path.positions[:, -1:].repeat(1, 4, 1, 1))
+    again = objective.begin(still)
+    assert len(solver.calls) == 3
+    # Only the term for particles that still move differs.
+    cost = ObjectiveTransport(OTSolverMean(), goal()).begin(still)
+    torch.testing.assert_close(again.loss, cost.loss)
+    torch.testing.assert_close(again.grad_positions[:, -1], cost.grad_positions[:, -1])
+    assert float(first.loss[0]) > float(again.loss[0])
+    objective.evaluate(trajectory())
+    assert [call[2] is not None and float(call[2].value) == float(cost.loss[0]) for call in solver.calls[3:]] == [True, True]
 
 
 def test_every_world_starts_from_its_own_solution() -> None:
