@@ -11,6 +11,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from cpdeform.core.descent import Descent
 from cpdeform.core.errors import InputError
 from cpdeform.core.memory import MemoryGauge, MemoryUse
 from cpdeform.core.objective import Objective
@@ -78,6 +79,7 @@ class TrajectoryOptimizer:
         initial_noise: Standard deviation of the first actions about zero, so that seeds differ.
         schedule: ``"halving"`` drops the worse half of a batch's worlds again and again, so that a single one is left for the last
             half of the iterations (successive halving [1]_); ``"paper"`` gives all worlds all iterations.
+        backtrack: Whether a world whose tools lost the clay goes back; see `cpdeform.core.descent.Descent`.
 
     References:
         .. [1] Jamieson, Talwalkar, "Non-stochastic Best Arm Identification and Hyperparameter Optimization", AISTATS 2016.
@@ -91,6 +93,7 @@ class TrajectoryOptimizer:
     tolerance: float = 1e-3
     initial_noise: float = 0.01
     schedule: str = "halving"
+    backtrack: bool = True
 
     def __post_init__(self) -> None:
         limits = {"iterations": self.iterations >= 1, "learning_rate": self.learning_rate > 0, "patience": self.patience >= 1}
@@ -134,9 +137,8 @@ class TrajectoryOptimizer:
             plan so far and stops.
         """
         count = state.batch_size
-        tried = actions.detach().clone().to(state.position).requires_grad_()
-        adam = torch.optim.Adam([tried], lr=self.learning_rate)
-        best_actions = tried.detach().clone()
+        best_actions = actions.detach().clone().to(state.position)
+        descent = Descent(best_actions, backtrack=self.backtrack)
         best_loss = torch.full((count,), torch.inf, dtype=torch.float64)
         reference = best_loss.clone()
         finite = torch.ones(count, dtype=torch.bool)
@@ -145,23 +147,21 @@ class TrajectoryOptimizer:
         since_improvement = 0
         for index in range(self.iterations):
             gauge = _gauge(simulator) if index == min(1, self.iterations - 1) else None
-            found, gradient, seconds = _evaluate(
-                simulator, _worlds(state, active), tried.detach()[active.to(tried.device)], objective, gauge
-            )
+            tried = descent.actions(active)
+            found, gradient, seconds = _evaluate(simulator, _worlds(state, active), tried, objective, gauge)
             gradient[:, gradient.shape[1] - rest_steps :] = 0.0
             evaluations += len(active)
             loss = torch.full_like(best_loss, torch.nan).index_copy(0, active, found)
             finite[active] &= torch.isfinite(found) & torch.isfinite(gradient).flatten(1).all(dim=1).cpu()
             better = torch.isfinite(loss) & (loss < best_loss)
             best_loss = torch.where(better, loss, best_loss)
-            best_actions[better.to(best_actions.device)] = tried.detach()[better.to(tried.device)]
+            best_actions[better.to(tried.device)] = tried[better[active].to(tried.device)]
             start = time.perf_counter()
-            adam.param_groups[0]["lr"] = self._step_size(index)
-            going = torch.zeros_like(finite)
-            going[active] = finite[active]
-            _step(adam, tried, gradient, active, going, best_actions)
+            going = finite[active]
+            kept = going.to(gradient.device)
+            descent.step(active[going], found[going], gradient[kept], learning_rate=self._step_size(index))
             seconds["optimizer"] = time.perf_counter() - start
-            memory = None if gauge is None else _memory_use(simulator, tried[active.to(tried.device)], gauge)
+            memory = None if gauge is None else _memory_use(simulator, tried, gauge)
             history.append(Iteration(index, self.iterations, loss, best_loss.clone(), seconds, memory))
             if on_iteration is not None:
                 on_iteration(history[-1])
@@ -197,17 +197,6 @@ def _worlds(state: State, active: Tensor) -> State:
     """The active worlds of a state."""
     index = active.to(state.position.device)
     return state if len(active) == state.batch_size else state.map(lambda tensor: tensor[index])
-
-
-def _step(adam: torch.optim.Adam, tried: Tensor, gradient: Tensor, active: Tensor, going: Tensor, best_actions: Tensor) -> None:
-    """One step of Adam and the clip to [-1, 1]; worlds that do not go on keep their best actions."""
-    keep = going.to(tried.device)[:, None, None]
-    full = torch.zeros_like(tried).index_copy(0, active.to(tried.device), gradient.to(tried))
-    tried.grad = torch.where(keep, full, torch.zeros_like(full))
-    adam.step()
-    with torch.no_grad():
-        tried.clamp_(-1.0, 1.0)
-        tried.copy_(torch.where(keep, tried, best_actions))
 
 
 def _gauge(simulator: Simulator) -> MemoryGauge:
