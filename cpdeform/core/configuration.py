@@ -16,7 +16,7 @@ from cpdeform.core.plugins import AUTO
 from cpdeform.core.scene import FrozenModel
 from cpdeform.core.task import Task, merge, validate
 
-PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType({"optimizer": {"schedule": "paper", "backtrack": False}})
+PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType({"optimizer": {"schedule": "paper", "backtrack": None}})
 """What ``algorithm=paper`` sets where the user does not: Algorithm 1 to the letter."""
 
 PAPER_PLACER_OPTIONS: Mapping[str, Any] = MappingProxyType(
@@ -35,7 +35,7 @@ class OptimizerConfiguration(FrozenModel):
     tolerance: float = Field(default=1e-3, ge=0.0)
     initial_noise: float = Field(default=0.01, ge=0.0)
     schedule: Literal["halving", "paper"] = "halving"
-    backtrack: bool = True
+    backtrack: int | None = Field(default=4, ge=1)
 
 
 class PrioritiesConfiguration(FrozenModel):

@@ -10,26 +10,27 @@ BACKTRACK = 0.5
 
 
 class Descent:
-    """Adam [1]_ on actions clipped to [-1, 1]; a world whose tools lost the clay goes back.
+    """Adam [1]_ on actions clipped to [-1, 1]; a world that gains nothing for a while goes back to its best plan.
 
-    A step too large lifts the tools off. Then no action has an influence any more: the gradient is zero, and Adam's momentum
-    carries the tools farther away. With `backtrack`, a world with a gradient of exactly zero is put back to its best plan that
-    had one, forgets its momentum and goes on from there with half the step size.
+    A step too large presses the tools too deep, the next ones lift them off the clay. There the gradient is small or zero, and
+    Adam's momentum carries the tools farther away. A world whose loss was not the lowest so far for `backtrack` steps in a row is
+    put back to its best plan, forgets its momentum and goes on from there with half the step size.
 
     Args:
         actions: First actions (B, T, A).
-        backtrack: Whether worlds go back.
+        backtrack: Steps without a gain after which a world goes back; never where absent.
 
     References:
         .. [1] Kingma, Ba, "Adam: A Method for Stochastic Optimization", ICLR 2015.
     """
 
-    def __init__(self, actions: Tensor, *, backtrack: bool) -> None:
+    def __init__(self, actions: Tensor, *, backtrack: int | None) -> None:
         # A parameter and a group for each world, since each has its own momentum and step size.
         self._worlds = [torch.nn.Parameter(world.detach().clone()) for world in actions]
         self._adam = torch.optim.Adam([{"params": [world]} for world in self._worlds])
         self._backtrack = backtrack
         self._scales = [1.0] * len(self._worlds)
+        self._idle = [0] * len(self._worlds)
         self._best: dict[int, tuple[float, Tensor, Tensor]] = {}
 
     def actions(self, worlds: Tensor) -> Tensor:
@@ -47,26 +48,32 @@ class Descent:
         """
         self._adam.zero_grad()
         for world, value, slope in zip(worlds.tolist(), loss.tolist(), gradient, strict=True):
-            parameter = self._worlds[world]
-            parameter.grad = slope.to(parameter)
-            if self._backtrack:
-                self._return_if_lost(world, value)
+            self._worlds[world].grad = slope.to(self._worlds[world])
+            if self._backtrack is not None:
+                self._note(world, value, slope)
+                if self._idle[world] >= self._backtrack:
+                    self._return(world)
             self._adam.param_groups[world]["lr"] = learning_rate * self._scales[world]
         self._adam.step()
         with torch.no_grad():
             for world in worlds.tolist():
                 self._worlds[world].clamp_(-1.0, 1.0)
 
-    def _return_if_lost(self, world: int, loss: float) -> None:
-        """Note a plan with a gradient if it is the best; take the one noted in the place of a plan without."""
+    def _note(self, world: int, loss: float, gradient: Tensor) -> None:
+        """Keep the plan if it is the world's best."""
+        if world not in self._best or loss < self._best[world][0]:
+            self._best[world] = (loss, self._worlds[world].detach().clone(), gradient.clone())
+            self._idle[world] = 0
+        else:
+            self._idle[world] += 1
+
+    def _return(self, world: int) -> None:
+        """Put the world back to its best plan, with that plan's gradient."""
         parameter = self._worlds[world]
-        gradient = parameter.grad
-        if gradient is not None and bool(gradient.any()):
-            if world not in self._best or loss < self._best[world][0]:
-                self._best[world] = (loss, parameter.detach().clone(), gradient.clone())
-        elif world in self._best:
-            _, actions, parameter.grad = self._best[world]
-            with torch.no_grad():
-                parameter.copy_(actions)
-            self._adam.state.pop(parameter, None)
-            self._scales[world] *= BACKTRACK
+        _, actions, gradient = self._best[world]
+        with torch.no_grad():
+            parameter.copy_(actions)
+        parameter.grad = gradient.to(parameter)
+        self._adam.state.pop(parameter, None)
+        self._scales[world] *= BACKTRACK
+        self._idle[world] = 0

@@ -79,7 +79,8 @@ class TrajectoryOptimizer:
         initial_noise: Standard deviation of the first actions about zero, so that seeds differ.
         schedule: ``"halving"`` drops the worse half of a batch's worlds again and again, so that a single one is left for the last
             half of the iterations (successive halving [1]_); ``"paper"`` gives all worlds all iterations.
-        backtrack: Whether a world whose tools lost the clay goes back; see `cpdeform.core.descent.Descent`.
+        backtrack: Iterations without a gain after which a world goes back to its best plan, with half the step size; never where
+            absent. See `cpdeform.core.descent.Descent`.
 
     References:
         .. [1] Jamieson, Talwalkar, "Non-stochastic Best Arm Identification and Hyperparameter Optimization", AISTATS 2016.
@@ -93,13 +94,15 @@ class TrajectoryOptimizer:
     tolerance: float = 1e-3
     initial_noise: float = 0.01
     schedule: str = "halving"
-    backtrack: bool = True
+    backtrack: int | None = 4
 
     def __post_init__(self) -> None:
         limits = {"iterations": self.iterations >= 1, "learning_rate": self.learning_rate > 0, "patience": self.patience >= 1}
         for name, fine in limits.items():
             if not fine:
                 raise InputError(f"optimizer.{name}", came=str(getattr(self, name)), expected="a positive number")
+        if self.backtrack is not None and self.backtrack < 1:
+            raise InputError("optimizer.backtrack", came=str(self.backtrack), expected="at least 1, or None")
         if not 0.0 < self.learning_rate_decay <= 1.0:
             raise InputError("optimizer.learning_rate_decay", came=str(self.learning_rate_decay), expected="above 0 and at most 1")
         for name in ("tolerance", "initial_noise"):
