@@ -200,6 +200,7 @@ def test_first_actions():
         {"learning_rate": 0.0},
         {"learning_rate_decay": 0.0},
         {"learning_rate_decay": 1.1},
+        {"backtrack": 0},
         {"patience": 0},
         {"tolerance": -1.0},
         {"initial_noise": float("nan")},
