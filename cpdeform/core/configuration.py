@@ -30,7 +30,6 @@ class OptimizerConfiguration(FrozenModel):
 
     iterations: int = Field(default=40, ge=1)
     learning_rate: float = Field(default=0.1, gt=0.0)
-    learning_rate_decay: float = Field(default=1.0, gt=0.0, le=1.0)
     patience: int = Field(default=15, ge=1)
     tolerance: float = Field(default=1e-3, ge=0.0)
     initial_noise: float = Field(default=0.01, ge=0.0)

@@ -73,7 +73,6 @@ class TrajectoryOptimizer:
     Attributes:
         iterations: The most gradient evaluations per world.
         learning_rate: Adam's step size, in units of action.
-        learning_rate_decay: Share of it that is left at the last of the `iterations`, reached along half a cosine [2]_; 1 keeps it.
         patience: Stop when no world improved by `tolerance` for this many iterations.
         tolerance: Smallest relative improvement of the loss that counts.
         initial_noise: Standard deviation of the first actions about zero, so that seeds differ.
@@ -84,12 +83,10 @@ class TrajectoryOptimizer:
 
     References:
         .. [1] Jamieson, Talwalkar, "Non-stochastic Best Arm Identification and Hyperparameter Optimization", AISTATS 2016.
-        .. [2] Loshchilov, Hutter, "SGDR: Stochastic Gradient Descent with Warm Restarts", ICLR 2017, equation 5.
     """
 
     iterations: int = 40
     learning_rate: float = 0.1
-    learning_rate_decay: float = 1.0
     patience: int = 15
     tolerance: float = 1e-3
     initial_noise: float = 0.01
@@ -103,8 +100,6 @@ class TrajectoryOptimizer:
                 raise InputError(f"optimizer.{name}", came=str(getattr(self, name)), expected="a positive number")
         if self.backtrack is not None and self.backtrack < 1:
             raise InputError("optimizer.backtrack", came=str(self.backtrack), expected="at least 1, or None")
-        if not 0.0 < self.learning_rate_decay <= 1.0:
-            raise InputError("optimizer.learning_rate_decay", came=str(self.learning_rate_decay), expected="above 0 and at most 1")
         for name in ("tolerance", "initial_noise"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"optimizer.{name}", came=str(getattr(self, name)), expected="zero or more")
@@ -162,7 +157,7 @@ class TrajectoryOptimizer:
             start = time.perf_counter()
             going = finite[active]
             kept = going.to(gradient.device)
-            descent.step(active[going], found[going], gradient[kept], learning_rate=self._step_size(index))
+            descent.step(active[going], found[going], gradient[kept], learning_rate=self.learning_rate)
             seconds["optimizer"] = time.perf_counter() - start
             memory = None if gauge is None else _memory_use(simulator, tried, gauge)
             history.append(Iteration(index, self.iterations, loss, best_loss.clone(), seconds, memory))
@@ -178,12 +173,6 @@ class TrajectoryOptimizer:
                 objective.keep([active.tolist().index(world) for world in survivors.tolist()])
                 active = survivors
         return OptimizationResult(best_actions, best_loss, finite, evaluations, tuple(history))
-
-    def _step_size(self, index: int) -> float:
-        """Adam's step size after the iteration with the given number."""
-        share = index / max(1, self.iterations - 1)
-        lowest = self.learning_rate_decay
-        return self.learning_rate * (lowest + 0.5 * (1.0 - lowest) * (1.0 + math.cos(math.pi * share)))
 
     def _survivors(self, active: Tensor, best_loss: Tensor, done: int) -> Tensor:
         """Which worlds go on after `done` iterations, in order."""

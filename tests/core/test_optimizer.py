@@ -20,13 +20,6 @@ class Distance(ObjectiveAutograd):
         return ((positions[:, -1].mean(dim=1) - self.goal) ** 2).sum(dim=-1)
 
 
-class Sum(ObjectiveAutograd):
-    """Sum of the final centre's coordinates: its gradient is the same everywhere, so that Adam's steps have the set size."""
-
-    def loss(self, positions, manipulator_poses):
-        return positions[:, -1].mean(dim=1).sum(dim=-1)
-
-
 @pytest.fixture
 def simulator(toy_task_file):
     return SimulatorToy(load_task(toy_task_file).scene, batch_size=3)
@@ -117,17 +110,6 @@ def test_stops_early(simulator, state):
     assert len(result.history) == 5
 
 
-@pytest.mark.parametrize("decay", [1.0, 0.2])
-def test_step_size_falls_along_half_a_cosine(simulator, state, decay):
-    optimizer = TrajectoryOptimizer(iterations=9, learning_rate=0.01, learning_rate_decay=decay, schedule="paper")
-    history = optimizer.minimize(simulator, state, zeros(), Sum()).history
-    losses = torch.stack([iteration.loss[0] for iteration in history])
-    steps = -losses.diff() / (15 * 0.02)
-    angle = torch.pi * torch.arange(8).double() / 8
-    expected = 0.01 * (decay + (1 - decay) * (1 + angle.cos()) / 2)
-    torch.testing.assert_close(steps, expected, rtol=1e-3, atol=0)
-
-
 def test_worlds_do_not_influence_each_other(simulator, state):
     actions = torch.randn(3, 5, 3, generator=torch.Generator().manual_seed(0)).double().clamp(-1, 1)
     optimizer, objective = TrajectoryOptimizer(iterations=10), Distance(goal(state, [0.05, 0.0, 0.02]))
@@ -198,8 +180,6 @@ def test_first_actions():
     [
         {"iterations": 0},
         {"learning_rate": 0.0},
-        {"learning_rate_decay": 0.0},
-        {"learning_rate_decay": 1.1},
         {"backtrack": 0},
         {"patience": 0},
         {"tolerance": -1.0},
