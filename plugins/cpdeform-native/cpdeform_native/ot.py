@@ -60,6 +60,10 @@ class OrderedPotentials(Potentials):
     target_order: Order | None = None
 
 
+MOST_WARM_ERROR = 0.05
+"""L1 error of the source marginal above which a warm solution is of no use: its value may be half of the right one."""
+
+
 class OTSolverNative(OTSolver):
     """Debiased Sinkhorn divergence in C++ for the CPU, for the cost c(x, y) = |x - y|^p and the temperature eps = blur^p.
 
@@ -164,7 +168,8 @@ class OTSolverNative(OTSolver):
 
         With `previous`, a call makes up to `warm_iterations` iterations, the source potential first: it is the one whose points
         moved, and the target's potential, a function on unmoved points, predicts it. What they leave accumulates slowly over
-        many calls, so start cold again from time to time. Pairs below 1e-3 of a point's mass are left out, less than the
+        many calls, so start cold again from time to time. Where they leave a marginal error above `MOST_WARM_ERROR`, since the
+        points moved too far, the call itself starts cold. Pairs below 1e-3 of a point's mass are left out, less than the
         iterations leave. The order of the points is kept until they have moved too far for it. `converged` still speaks of
         `tolerance`. A solution for tensors of another device is computed on the CPU and moved there.
         """
@@ -172,7 +177,10 @@ class OTSolverNative(OTSolver):
         if source.dtype not in _ROUNDING:
             raise InputError("source", came=f"{source.dtype}", expected="torch.float32 or torch.float64")
         state = usable_state(previous, problem, self.blur, debias=self.debias)
-        return self._solve(problem, state)
+        result = self._solve(problem, state)
+        if state is not None and not result.marginal_error <= MOST_WARM_ERROR:
+            result = self._solve(problem, None)
+        return result
 
     def _solve(self, problem: Problem, state: Potentials | None) -> OTResult:
         source, target = problem.source, problem.target

@@ -78,6 +78,19 @@ def test_warm_call_is_close_to_a_cold_one_and_cheaper() -> None:
     assert warm.iterations < cold.iterations
 
 
+def test_points_that_moved_too_far_are_solved_cold() -> None:
+    """A rod that was carried away and turned: few iterations from the old potentials do not reach the new ones."""
+    rod = (cloud(1500, seed=25).float() - 0.5) * torch.tensor([0.1, 0.1, 1.2])
+    source, target = rod + torch.tensor([0.5, 0.1, 0.5]), rod.flip(0) + torch.tensor([0.6, 0.25, 0.6])
+    turn = torch.tensor([[0.96, 0.0, 0.28], [0.0, 1.0, 0.0], [-0.28, 0.0, 0.96]])
+    carried = rod @ turn + torch.tensor([0.6, 0.25, 0.6])
+    solver = OTSolverNative(blur=2e-3, warm_iterations=2)
+    start, cold = solver.solve(source, target), solver.solve(carried, target)
+    warm = solver.solve(carried, target, previous=start)
+    assert (float(warm.value), warm.iterations) == (float(cold.value), cold.iterations)
+    assert solver.solve(source + 1e-4, target, previous=start).iterations <= 2
+
+
 @pytest.mark.parametrize("debias", [True, False])
 def test_warm_call_on_the_same_clouds_changes_little(debias: bool) -> None:
     source, target = cloud(400, seed=25), cloud(300, seed=26) + 0.02
