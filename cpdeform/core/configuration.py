@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, PositiveFloat, field_validator
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.objectives.contact import ContactKind
@@ -61,6 +61,8 @@ class ObjectiveConfiguration(FrozenModel):
             and 1 for ``"plasticinelab"``.
         coast_steps: (``"transport"``) Environment steps for which particles are taken to go on as fast as in the last one; see
             `ObjectiveTransport`.
+        axis_scale: (``"transport"``) Positive factors of the coordinates x, y, z, dimensionless, before distances are taken; see
+            `ObjectiveTransport`.
         contact: Kind of the contact term of ``"plasticinelab"``; see `cpdeform.core.objectives.contact.contact_loss`.
     """
 
@@ -70,6 +72,7 @@ class ObjectiveConfiguration(FrozenModel):
     refresh: int = Field(default=50, ge=1)
     contact_weight: float | None = Field(default=None, ge=0.0)
     coast_steps: float = Field(default=0.0, ge=0.0)
+    axis_scale: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (1.0, 1.0, 1.0)
     contact: ContactKind = "plasticinelab"
 
 

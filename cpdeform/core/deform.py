@@ -253,4 +253,5 @@ def make_objective(
         refresh=options.refresh,
         contact_weight=options.contact_weight or 0.0,
         coast_steps=options.coast_steps,
+        axis_scale=options.axis_scale,
     )

@@ -77,9 +77,11 @@ class GraspSearch:
         across = torch.eye(3).to(direction)[direction.abs() < 0.5]
         reach = float((points.amax(0) - points.amin(0)).max()) + 2.0 * float(half.max())
         center, width = contact, LATERAL_REACH * (across @ half)
+        lower, upper = self._bounds(tools, along=direction)
         best: Grasp | None = None
         for _ in range(self.refinements + 1):
-            starts = _lines(center, across, width, self.lines)
+            # A contact point beyond the tools' bounds is faced from as near as they get.
+            starts = _lines(center, across, width, self.lines).clamp(lower, upper)
             found = [self._place(poses, tools, quaternions, starts, sign * direction, points, reach, cost) for sign in (1.0, -1.0)]
             for grasp, start in (item for item in found if item is not None):
                 if best is None or grasp.cost < best.cost:
@@ -118,6 +120,13 @@ class GraspSearch:
         for index, quaternion, positions in zip(tools, quaternions, placed, strict=True):
             result[index, :3], result[index, 3:7] = positions[chosen], quaternion
         return Grasp(result, float(costs[chosen])), starts[chosen]
+
+    def _bounds(self, tools: Sequence[int], *, along: Tensor) -> tuple[Tensor, Tensor]:
+        """Corners (3,), (3,) that all of the tools stay between, without limits along a direction (3,)."""
+        lower = along.new_tensor([self.manipulators[index].lower_bound for index in tools]).amax(dim=0)
+        upper = along.new_tensor([self.manipulators[index].upper_bound for index in tools]).amin(dim=0)
+        free = along.abs() > 0.5
+        return lower.masked_fill(free, -torch.inf), upper.masked_fill(free, torch.inf)
 
     def _surface(self, index: int, pose: Tensor) -> Tensor:
         """Points (P, 3) all over another tool's surface."""

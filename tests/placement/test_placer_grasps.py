@@ -76,6 +76,21 @@ def test_plates_face_each_other_through_the_contact_point() -> None:
         assert bool((local[1:].abs() <= torch.tensor([0.135, 0.07])).all())
 
 
+def test_a_contact_point_beyond_the_bounds_is_faced_from_as_near_as_they_allow() -> None:
+    low = [ball.model_copy(update={"upper_bound": (1.0, 0.36, 1.0)}) for ball in balls((0.3, 0.3, 0.5), (0.7, 0.3, 0.5))]
+    stage = make_stage([block()], low, (0.55, 0.45, 0.45))
+    placements = {placement.label: placement for placement in PlacerTransport().ask(stage)}
+    contact = stage.state.position[0, int(stage.priorities.argmax())]
+    assert float(contact[1]) > 0.36 + 0.03
+    # Along y the bound keeps the second tool from the body's upper side.
+    assert set(placements) == {"left-right", "front-back"}
+    for label, axis in (("left-right", 2), ("front-back", 0)):
+        pose = placements[label].pose
+        assert torch.allclose(pose[:, 1], torch.tensor(0.36).to(pose), atol=1e-6)
+        assert float((pose[:, axis] - contact[axis]).abs().max()) <= 0.03
+        assert all(-1e-9 <= gap < 2e-5 for gap in gaps(stage, placements[label]))
+
+
 def test_first_tool_takes_the_better_side() -> None:
     stage = make_stage([block(widths=(0.2, 0.1, 0.1))], plates(), (0.6, 0.4, 0.5))
     (placement,) = PlacerTransport(poses=["left-right"]).ask(stage)

@@ -58,6 +58,7 @@ class ObjectiveTransport(Objective):
         refresh: int | None = None,
         contact_weight: float = 0.0,
         coast_steps: float = 0.0,
+        axis_scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
         scene: Scene | None = None,
     ) -> None:
         if target.ndim != 2 or target.shape[1] != 3 or target.shape[0] == 0:
@@ -68,11 +69,14 @@ class ObjectiveTransport(Objective):
         for name, value in (("contact_weight", contact_weight), ("coast_steps", coast_steps)):
             if not 0.0 <= value < float("inf"):
                 raise InputError(name, came=str(value), expected="a finite number of at least 0")
+        if len(axis_scale) != 3 or not all(0.0 < factor < float("inf") for factor in axis_scale):
+            raise InputError("axis_scale", came=str(axis_scale), expected="three positive finite numbers")
         if contact_weight > 0.0 and scene is None:
             raise InputError("scene", came="None", expected="the scene", remedy="The contact term needs the shapes of its tools.")
         self.solver, self.target, self.points, self.seed = solver, target.detach(), points, seed
         self.warm_start, self.refresh = warm_start and solver.capabilities.warm_start, refresh
         self.contact_weight, self.coast_steps, self.scene = contact_weight, coast_steps, scene
+        self._scale = torch.tensor(axis_scale, dtype=torch.float64)
         self._previous: list[OTResult] = []
         self._start: OTResult | None = None
         self._start_cloud: Tensor | None = None
@@ -141,12 +145,14 @@ class ObjectiveTransport(Objective):
     def _transport(self, final: Tensor, solutions: list[OTResult] | None) -> tuple[Tensor, Tensor]:
         """Cost (B,) and gradient (B, N, 3) of final positions (B, N, 3)."""
         source_index, target_index = (index.to(final.device) for index in self._subsets(final.shape[1]))
-        results = self._solve(final[:, source_index], self.target.to(final)[target_index]) if solutions is None else solutions
+        scale = self._scale.to(final)
+        clouds, target = scale * final[:, source_index], scale * self.target.to(final)[target_index]
+        results = self._solve(clouds, target) if solutions is None else solutions
         self._previous = results if self.warm_start else []
         self._calls += 1
         gradient = torch.zeros_like(final)
         for world, result in enumerate(results):
-            gradient[world, source_index] = result.source_gradient.to(final)
+            gradient[world, source_index] = scale * result.source_gradient.to(final)
         return torch.stack([result.value.to(final) for result in results]), gradient
 
     def _solve(self, clouds: Tensor, target: Tensor) -> list[OTResult]:

@@ -228,3 +228,22 @@ def test_coasting_bounds_the_distance_later_and_has_the_right_gradient() -> None
     at_rest = positions.clone()
     at_rest[:, -1] = at_rest[:, -2]
     assert all(not part.any() for part in coast(at_rest))
+
+
+def test_axis_scale_counts_one_coordinate_more_and_has_the_right_gradient() -> None:
+    path, target = trajectory(), goal()
+
+    def transport(positions: Tensor, scale: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
+        objective = ObjectiveTransport(OTSolverMean(), target, axis_scale=scale)
+        result = objective.evaluate(dataclasses.replace(path, positions=positions))
+        return result.loss, result.grad_positions
+
+    offset = path.positions[:, -1].mean(dim=1) - target.mean(dim=0)
+    factors = torch.tensor([1.0, 4.0, 0.5], dtype=torch.float64)
+    loss, gradient = transport(path.positions, (1.0, 4.0, 0.5))
+    assert torch.allclose(loss, 0.5 * (factors * offset).square().sum(dim=1))
+    direction = torch.randn(path.positions.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    ahead, back = (transport(path.positions + sign * 1e-6 * direction, (1.0, 4.0, 0.5))[0] for sign in (1, -1))
+    assert torch.allclose((gradient * direction).sum(dim=(1, 2, 3)), (ahead - back) / 2e-6, rtol=1e-6)
+    with pytest.raises(InputError, match=r"axis_scale: got \(1.0, 0.0, 1.0\)"):
+        ObjectiveTransport(OTSolverMean(), target, axis_scale=(1.0, 0.0, 1.0))
