@@ -11,7 +11,7 @@ from rich import progress as rich_progress
 from rich.console import Console
 from torch import Tensor
 
-from cpdeform.core.optimizer import Iteration
+from cpdeform.core.optimizer import SEARCH, Iteration
 from cpdeform.core.result import Observer, StageResult
 from cpdeform.core.task import Task
 
@@ -96,7 +96,8 @@ class ProgressLines(Progress):
         """Print a line if the last one is some time ago."""
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + SECONDS_BETWEEN_LINES
-            text = f"stage {stage + 1}, iteration {iteration.index + 1}/{iteration.count}, {_losses(iteration)}"
+            name = "iteration" if iteration.phase == SEARCH else iteration.phase
+            text = f"stage {stage + 1}, {name} {iteration.index + 1}/{iteration.count}, {_losses(iteration)}"
             self._print(text)
 
     def stage_finished(self, result: StageResult) -> None:

@@ -23,6 +23,8 @@ from cpdeform.core.objective import Objective
 from cpdeform.core.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
 from cpdeform.core.ot import OTSolver
 from cpdeform.core.placer import LEAST_GAIN, Placement, PlacementResult, Placer, Stage
+from cpdeform.core.priorities import PriorityKind, transport_priorities
+from cpdeform.core.refinement import Refinement, gained
 from cpdeform.core.result import DeformResult, Observer, StageResult, Status
 from cpdeform.core.scene import Scene
 from cpdeform.core.signed_distance import signed_distance
@@ -45,6 +47,8 @@ class Planner:
         placer: Turns priorities into candidate placements.
         objective: The shape loss.
         optimizer: Finds actions.
+        priority_kind: What the priorities are; see `transport_priorities`.
+        refinement: Goes on from each stage's best plan before it is executed; not part of Algorithm 1.
         seed: Seed of first actions and random placements.
         observers: Told of every iteration and stage.
         names: Names of the parts for the record.
@@ -56,6 +60,8 @@ class Planner:
     placer: Placer
     objective: Objective
     optimizer: TrajectoryOptimizer
+    priority_kind: PriorityKind = "potential"
+    refinement: Refinement | None = None
     seed: int = 0
     observers: tuple[Observer, ...] = ()
     names: dict[str, str] = dataclasses.field(default_factory=dict)
@@ -134,7 +140,7 @@ class Planner:
         if not self.simulator.capabilities.differentiable:
             raise CapabilityError(f"{type(self.simulator).__name__} has no gradient; choose a differentiable simulator.")
         placing, transport = self.placer.capabilities, self.ot_solver.capabilities
-        if placing.needs_priorities and transport.potentials != "entropic":
+        if placing.needs_priorities and self.priority_kind == "potential" and transport.potentials != "entropic":
             raise CapabilityError(
                 f"{type(self.ot_solver).__name__} gives exact dual potentials, which are no transport priorities: where the shapes "
                 "agree they are arbitrary. Choose a solver with entropic potentials, such as pot or geomloss."
@@ -168,7 +174,7 @@ class Planner:
         # "priorities f = optimal-transport potentials between current shape S_i and goal G"
         priorities = torch.full_like(state.position[0, :, 0], torch.nan)
         if self.placer.capabilities.needs_priorities:
-            priorities = self.ot_solver.solve(state.position[0], target).source_potential
+            priorities = transport_priorities(self.ot_solver.solve(state.position[0], target), kind=self.priority_kind)
         clock.lap("transport")
         stage = Stage(index, self.task.scene, state, target, priorities, generator, loss_before, failed)
         candidates: list[PlacementResult] = []
@@ -199,6 +205,14 @@ class Planner:
             if not loss < loss_before:
                 trajectory, loss, status = None, loss_before, Status.NO_IMPROVEMENT
         clock.lap("execution")
+        if trajectory is not None and best is not None and self.refinement is not None:
+            refined = self._refine(self.refinement, index, state, candidates[best], loss_before)
+            evaluations += refined.plans.gradient_evaluations
+            history.extend(refined.plans.history)
+            if refined.trajectory is not None:
+                trajectory, loss = refined.trajectory, refined.loss
+                candidates[best] = dataclasses.replace(candidates[best], actions=trajectory.actions[0], loss=loss)
+            clock.lap("refinement")
         seconds["total"] = clock.total()
         finished = trajectory is not None
         return StageResult(
@@ -247,6 +261,16 @@ class Planner:
                 )
             )
         return found
+
+    def _refine(self, refinement: Refinement, index: int, state: State, candidate: PlacementResult, loss_before: float) -> _Refined:
+        """Refine a plan, and execute what was found if it is better by both objectives: the refinement's, and the stage's start."""
+        start = state.with_manipulators(candidate.placement.pose.unsqueeze(0))
+        rest, notify = self.task.rest_steps, self._notifier(index)
+        plans = refinement.refine(self.simulator, start, candidate.actions, rest_steps=rest, on_iteration=notify)
+        if not gained(plans):
+            return _Refined(plans, None, loss_before)
+        trajectory, loss = self._execute(state, dataclasses.replace(candidate, actions=plans.actions[0]))
+        return _Refined(plans, trajectory if loss < loss_before else None, loss)
 
     def _notifier(self, index: int) -> Callable[[Iteration], None]:
         def notify(iteration: Iteration) -> None:
@@ -330,6 +354,15 @@ def _stage_status(candidates: list[PlacementResult], best: int | None, loss_befo
     if candidates[best].loss < loss_before:
         return Status.FINISHED
     return Status.NO_IMPROVEMENT if any(candidate.finite for candidate in candidates) else Status.NON_FINITE
+
+
+@dataclasses.dataclass(frozen=True)
+class _Refined:
+    """Plans of a refinement, and the execution of the best one; None where the plan stays as it was."""
+
+    plans: OptimizationResult
+    trajectory: Trajectory | None
+    loss: float
 
 
 class _Clock:

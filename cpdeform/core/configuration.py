@@ -13,10 +13,18 @@ from pydantic import Field, PositiveFloat, field_validator
 from cpdeform.core.errors import InputError
 from cpdeform.core.objectives.contact import ContactKind
 from cpdeform.core.plugins import AUTO
+from cpdeform.core.priorities import PriorityKind
 from cpdeform.core.scene import FrozenModel
 from cpdeform.core.task import Task, merge, validate
 
-PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType({"optimizer": {"schedule": "paper", "backtrack": None}})
+PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType(
+    {
+        "optimizer": {"schedule": "paper", "backtrack": None},
+        "objective": {"axis_scale": (1.0, 1.0, 1.0), "coast_steps": 0.0},
+        "priorities": {"kind": "potential"},
+        "refinement": {"iterations": 0},
+    }
+)
 """What ``algorithm=paper`` sets where the user does not: Algorithm 1 to the letter."""
 
 PAPER_PLACER_OPTIONS: Mapping[str, Any] = MappingProxyType(
@@ -41,9 +49,14 @@ class PrioritiesConfiguration(FrozenModel):
     """How transport priorities are computed, on all particles and once per stage.
 
     Attributes:
+        kind: ``"potential"``: the dual potentials of the cost |x - y| (the paper); ``"displacement"``: the distance that transport
+            of the cost |x - y|^2 moves each particle, from a solver with an option `exponent`. See
+            `cpdeform.core.priorities.transport_priorities`.
         blur: Entropic blur of the transport problem, length units. The larger, the quicker and the smoother; up to half a
-            centimetre the potentials' peak stays at the particles that have to move.
+            centimetre the potentials' peak stays at the particles that have to move, displacements allow for two.
     """
+
+    kind: PriorityKind = "potential"
 
     blur: float = Field(default=5e-3, gt=0.0)
 
@@ -76,6 +89,20 @@ class ObjectiveConfiguration(FrozenModel):
     contact: ContactKind = "plasticinelab"
 
 
+class RefinementConfiguration(FrozenModel):
+    """How a stage's best plan is refined by the mass of the goal's grid nodes, see `cpdeform.core.objectives.density`.
+
+    Attributes:
+        iterations: The most gradient evaluations, and never more than the search's; 0 for no refinement.
+        learning_rate: Adam's step size, in units of action.
+        patience: Stop when nothing improved for this many iterations.
+    """
+
+    iterations: int = Field(default=0, ge=0)
+    learning_rate: float = Field(default=0.03, gt=0.0)
+    patience: int = Field(default=15, ge=1)
+
+
 class RunConfiguration(FrozenModel):
     """Everything that defines a run, under the names of the command line and of `--set`.
 
@@ -94,6 +121,7 @@ class RunConfiguration(FrozenModel):
         optimizer: Options of the optimiser.
         objective: Options of the loss.
         priorities: Options of the transport priorities.
+        refinement: Options of the refinement of each stage's plan.
         scene: Changes of the task's scene, e.g. ``{"ground_friction": 2.0, "bodies": {"0": {"particle_count": 3000}}}``.
         simulator_options: Further keyword options of the simulator.
         ot_options: Further keyword options of the transport solver that gives the priorities.
@@ -114,6 +142,7 @@ class RunConfiguration(FrozenModel):
     optimizer: OptimizerConfiguration = OptimizerConfiguration()
     objective: ObjectiveConfiguration = ObjectiveConfiguration()
     priorities: PrioritiesConfiguration = PrioritiesConfiguration()
+    refinement: RefinementConfiguration = RefinementConfiguration()
     scene: dict[str, Any] = Field(default_factory=dict)
     simulator_options: dict[str, Any] = Field(default_factory=dict)
     ot_options: dict[str, Any] = Field(default_factory=dict)

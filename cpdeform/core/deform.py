@@ -8,16 +8,25 @@ from typing import Any
 import torch
 
 from cpdeform.core.algorithm import Planner
-from cpdeform.core.configuration import ObjectiveConfiguration, RunConfiguration, with_task_settings
-from cpdeform.core.errors import InputError
+from cpdeform.core.configuration import (
+    ObjectiveConfiguration,
+    RefinementConfiguration,
+    RunConfiguration,
+    with_task_settings,
+)
+from cpdeform.core.errors import InputError, UnknownNameError
 from cpdeform.core.hook_observer import HookObserver
+from cpdeform.core.metrics import target_mass_grid
 from cpdeform.core.objective import Objective
+from cpdeform.core.objectives.density import ObjectiveDensity
 from cpdeform.core.objectives.plasticinelab import ObjectivePlasticineLab, mass_grid
 from cpdeform.core.objectives.transport import ObjectiveTransport
 from cpdeform.core.optimizer import TrajectoryOptimizer
 from cpdeform.core.ot import OTSolver
 from cpdeform.core.placer import Placer
 from cpdeform.core.plugins import AUTO, Registry, load_registry
+from cpdeform.core.priorities import DISPLACEMENT_EXPONENT, PriorityKind
+from cpdeform.core.refinement import Refinement
 from cpdeform.core.result import DeformResult, Observer
 from cpdeform.core.resume import Resumption
 from cpdeform.core.simulator import Simulator
@@ -82,16 +91,22 @@ def deform(
     used_placer: Placer = _part(placer, "placer", registry, **defaults.placer_options)
     options = {"scene": task.scene, "batch_size": MAX_WORLDS, "device": device}
     used_simulator: Simulator = _part(simulator, "simulator", registry, **options)
+    used_optimizer = optimizer or TrajectoryOptimizer(**defaults.optimizer.model_dump())
+    own_objective = objective is not None
     if objective is None:
         objective = make_objective(task, ot_solver, used_simulator, options=defaults.objective, registry=registry)
-    used_solver: OTSolver = _part(ot_solver, "ot_solver", registry, blur=defaults.priorities.blur)
+    # A solver given as an object has a cost of its own; its potentials are priorities whatever the cost.
+    kind: PriorityKind = defaults.priorities.kind if isinstance(ot_solver, str) else "potential"
+    used_solver = _priorities_solver(ot_solver, defaults, registry=registry) if isinstance(ot_solver, str) else ot_solver
     planner = Planner(
         task=task,
         simulator=used_simulator,
         ot_solver=used_solver,
         placer=used_placer,
         objective=objective,
-        optimizer=optimizer or TrajectoryOptimizer(**defaults.optimizer.model_dump()),
+        optimizer=used_optimizer,
+        priority_kind=kind,
+        refinement=None if own_objective else make_refinement(task, options=defaults.refinement, most=used_optimizer.iterations),
         seed=seed,
         observers=(*observers, HookObserver(registry.manager)),
         names=names,
@@ -106,6 +121,25 @@ def _part_name(part: object) -> str:
 def _part(part: Any, kind: str, registry: Registry, **options: Any) -> Any:
     """A part given as an object, or the one that a name stands for, created with options."""
     return registry.create(kind, part, **options) if isinstance(part, str) else part
+
+
+def _priorities_solver(name: str, configuration: RunConfiguration, *, registry: Registry) -> OTSolver:
+    """The solver that gives the priorities, with the cost that their kind needs."""
+    options = {"blur": configuration.priorities.blur, **configuration.ot_options}
+    if configuration.priorities.kind == "displacement":
+        options["exponent"] = DISPLACEMENT_EXPONENT
+    try:
+        solver: OTSolver = registry.create("ot_solver", name, **options)
+    except UnknownNameError as error:
+        if configuration.priorities.kind == "potential" or error.name != "exponent":
+            raise
+        raise InputError(
+            "priorities.kind",
+            came='"displacement"',
+            expected=f'"potential", since the transport solver {name} has no option exponent',
+            remedy="Set it with --set priorities.kind=potential, or choose another solver with --ot.",
+        ) from error
+    return solver
 
 
 def deform_configuration(
@@ -139,8 +173,7 @@ def deform_configuration(
     simulator = registry.create(
         "simulator", configuration.backend, scene=task.scene, device=configuration.device, **simulator_options
     )
-    solver_options = {"blur": configuration.priorities.blur, **configuration.ot_options}
-    ot_solver = registry.create("ot_solver", configuration.ot, **solver_options)
+    ot_solver = _priorities_solver(configuration.ot, configuration, registry=registry)
     objective = make_objective(task, configuration.ot, simulator, options=configuration.objective, registry=registry)
     planner = Planner(
         task=task,
@@ -149,6 +182,8 @@ def deform_configuration(
         placer=placer,
         objective=objective,
         optimizer=TrajectoryOptimizer(**configuration.optimizer.model_dump()),
+        priority_kind=configuration.priorities.kind,
+        refinement=make_refinement(task, options=configuration.refinement, most=configuration.optimizer.iterations),
         seed=configuration.seed,
         observers=(*observers, HookObserver(registry.manager)),
         names={"backend": configuration.backend, "ot": configuration.ot, "placer": configuration.placer},
@@ -254,4 +289,22 @@ def make_objective(
         contact_weight=options.contact_weight or 0.0,
         coast_steps=options.coast_steps,
         axis_scale=options.axis_scale,
+    )
+
+
+def make_refinement(task: Task, *, options: RefinementConfiguration, most: int) -> Refinement | None:
+    """The refinement that a configuration describes; None for none.
+
+    Args:
+        task: Its target is the goal, with the node masses of its file where it has them.
+        options: Iterations, step size, patience.
+        most: The most iterations, whatever the options say; those of the search.
+    """
+    iterations = min(options.iterations, most)
+    if iterations == 0:
+        return None
+    grid = target_mass_grid(task, torch.as_tensor(task.load_target()).double())
+    return Refinement(
+        objective=ObjectiveDensity(task.scene, grid),
+        optimizer=TrajectoryOptimizer(**(options.model_dump() | {"iterations": iterations})),
     )

@@ -44,6 +44,7 @@ class UnknownNameError(InputError):
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
         hint = f'Did you mean "{near[0]}"?' if near else ""
         self.kind = kind
+        self.name = name
         self.known = names
         super().__init__(
             kind,

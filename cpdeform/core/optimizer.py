@@ -21,6 +21,9 @@ from cpdeform.core.state import State
 SCHEDULES = ("halving", "paper")
 """How iterations are shared out among worlds; see `TrajectoryOptimizer.schedule`."""
 
+SEARCH = "search"
+"""`Iteration.phase` of the search for a plan."""
+
 LEAST_ITERATIONS = 5
 """No world is dropped before: the first losses are those of tools that have hardly moved."""
 
@@ -37,6 +40,7 @@ class Iteration:
         best_loss: Lowest loss (B,) so far.
         seconds: Wall time of the parts `rollout`, `objective`, `vjp` and `optimizer`.
         memory: Memory of rollout and gradient; measured in one iteration, after the first if there are several, else None.
+        phase: ``"search"``, or ``"refinement"`` where the loss is that of `cpdeform.core.refinement.Refinement`.
     """
 
     index: int
@@ -45,6 +49,7 @@ class Iteration:
     best_loss: Tensor
     seconds: dict[str, float]
     memory: MemoryUse | None = None
+    phase: str = SEARCH
 
 
 @dataclasses.dataclass(frozen=True)

@@ -53,6 +53,7 @@ class OTResult:
         marginal_error: Violation of the source marginal in the L1 norm, dimensionless; nan where the solver does not know.
         blur: Entropic blur, length units (0 for an exact solution).
         warm_state: What `solve(previous=...)` uses beyond the fields above; opaque, owned by the solver.
+        exponent: Power p of the distance in the cost.
     """
 
     value: Tensor
@@ -64,6 +65,7 @@ class OTResult:
     marginal_error: float
     blur: float
     warm_state: object = None
+    exponent: int = 1
 
 
 class OTSolver(abc.ABC):

@@ -139,6 +139,7 @@ class RunRecorder(Observer):
                 "kind": "iteration",
                 "stage": stage,
                 "batch": self._batch[stage],
+                "phase": iteration.phase,
                 "iteration": iteration.index,
                 "loss": iteration.loss,
                 "best_loss": iteration.best_loss,

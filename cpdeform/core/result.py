@@ -65,7 +65,8 @@ class StageResult:
         loss: Loss of the executed plan; `loss_before` where none was executed.
         gradient_evaluations: Gradient evaluations of this stage, all worlds.
         history: Every iteration of the optimiser, per round of candidates.
-        seconds: Wall time of the parts `transport`, `placement`, `optimization`, `execution` and `total`.
+        seconds: Wall time of the parts `transport`, `placement`, `optimization`, `execution`, `refinement` (where there is
+            one) and `total`.
     """
 
     index: int

@@ -217,4 +217,5 @@ def finish(problem: Problem, potentials: Potentials, *, blur: float, tolerance: 
         marginal_error=error,
         blur=blur,
         warm_state=potentials,
+        exponent=problem.exponent,
     )

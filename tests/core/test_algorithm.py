@@ -9,7 +9,7 @@ from cpdeform_toy.parts import OTSolverExactToy, OTSolverToy, PlacerFixedToy, Pl
 from cpdeform_toy.simulator import SimulatorToy
 
 from cpdeform.core.algorithm import Planner, failed_contacts, still_trajectory
-from cpdeform.core.configuration import RunConfiguration
+from cpdeform.core.configuration import PrioritiesConfiguration, RunConfiguration
 from cpdeform.core.deform import deform, deform_configuration
 from cpdeform.core.errors import CapabilityError, InputError, UnknownNameError
 from cpdeform.core.objective import Objective, ObjectiveResult
@@ -272,3 +272,13 @@ def test_deform_by_configuration(toy_task_file, toy_entry_points):
     bad = configuration.model_copy(update={"simulator_options": {"device": "cpu"}})
     with pytest.raises(InputError, match="Set device instead"):
         deform_configuration(bad, registry=registry)
+    shifted = configuration.model_copy(update={"priorities": PrioritiesConfiguration(kind="displacement")})
+    with pytest.raises(InputError, match=r"transport solver toy has no option exponent\. Set it with --set priorities.kind=potential"):
+        deform_configuration(shifted, registry=registry)
+
+
+def test_priorities_may_be_displacements_which_an_exact_solver_has_too(task):
+    for solver in (OTSolverToy(), OTSolverExactToy()):
+        (stage,) = planner(task, solver=solver, priority_kind="displacement", iterations=2).run(stages=1).stages
+        way = torch.as_tensor(task.load_target()).mean(dim=0) - stage.state_before.position[0].mean(dim=0)
+        assert torch.allclose(stage.priorities, way.norm().to(stage.priorities))

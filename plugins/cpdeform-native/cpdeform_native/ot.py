@@ -273,4 +273,5 @@ class OTSolverNative(OTSolver):
             marginal_error=error,
             blur=self.blur,
             warm_state=state,
+            exponent=self.exponent,
         )

@@ -23,7 +23,7 @@ class OTSolverToy(OTSolver):
         difference = a @ source - b @ target
         value = (difference**2).sum()
         f, g = fix_gauge(2.0 * source @ difference, -2.0 * target @ difference, a)
-        return OTResult(value, f, g, 2.0 * a[:, None] * difference, True, 1, 0.0, self.blur)
+        return OTResult(value, f, g, 2.0 * a[:, None] * difference, True, 1, 0.0, self.blur, exponent=2)
 
 
 class OTSolverExactToy(OTSolverToy):

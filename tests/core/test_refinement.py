@@ -1,0 +1,94 @@
+"""Refinement of a stage's plan, on the toy simulator: what is kept, what is counted."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from cpdeform_toy.parts import OTSolverToy, PlacerToy
+from cpdeform_toy.simulator import SimulatorToy
+
+from cpdeform.core.algorithm import Planner
+from cpdeform.core.configuration import RefinementConfiguration, RunConfiguration, with_task_settings
+from cpdeform.core.deform import make_refinement
+from cpdeform.core.objective import ObjectiveAutograd
+from cpdeform.core.objectives.transport import ObjectiveTransport
+from cpdeform.core.optimizer import TrajectoryOptimizer
+from cpdeform.core.refinement import REFINEMENT, Refinement
+from cpdeform.core.task import load_task
+
+ITERATIONS = 8
+
+
+class Offset(ObjectiveAutograd):
+    """Squared distance of the final centre of mass from a point."""
+
+    def __init__(self, point):
+        self.point = point
+
+    def loss(self, positions, manipulator_poses):
+        return (positions[:, -1].mean(dim=1) - self.point.to(positions)).square().sum(dim=-1)
+
+
+@pytest.fixture
+def task(toy_task_file):
+    return load_task(toy_task_file)
+
+
+def run(task, point=None, **options):
+    optimizer = TrajectoryOptimizer(iterations=ITERATIONS, learning_rate=0.02)
+    refinement = None if point is None else Refinement(objective=Offset(point), optimizer=optimizer)
+    planner = Planner(
+        task=task,
+        simulator=SimulatorToy(task.scene, batch_size=4),
+        ot_solver=OTSolverToy(),
+        placer=PlacerToy(),
+        objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene),
+        optimizer=TrajectoryOptimizer(iterations=2),
+        refinement=refinement,
+        **options,
+    )
+    return planner.run(stages=1).stages[0]
+
+
+def goal(task):
+    return torch.as_tensor(task.load_target()).mean(dim=0)
+
+
+def test_a_better_plan_is_executed_and_counted(task):
+    plain, refined = run(task), run(task, goal(task))
+    assert refined.loss < plain.loss
+    assert refined.loss == pytest.approx(float(Offset(goal(task)).loss(refined.positions[None], None)[0]), rel=1e-5)
+    assert refined.best == plain.best
+    assert torch.equal(refined.actions, refined.candidates[refined.best].actions)
+    assert refined.candidates[refined.best].loss == refined.loss
+    assert refined.gradient_evaluations == plain.gradient_evaluations + ITERATIONS
+    assert [iteration.phase for iteration in refined.history] == ["search"] * 2 + [REFINEMENT] * ITERATIONS
+    assert "refinement" in refined.seconds
+    assert "refinement" not in plain.seconds
+
+
+def test_a_plan_that_cannot_gain_stays(task):
+    """Its end is the refinement's goal already."""
+    plain = run(task)
+    refined = run(task, plain.positions[-1].mean(dim=0))
+    assert torch.equal(refined.actions, plain.actions)
+    assert refined.loss == plain.loss
+
+
+def test_a_plan_worse_than_leaving_the_shape_alone_is_dropped(task):
+    start = torch.as_tensor(task.load_target()).mean(dim=0)
+    plain = run(task)
+    away = plain.state_before.position[0].mean(dim=0) * 2.0 - start.to(plain.state_before.position)
+    refined = run(task, away)
+    assert torch.equal(refined.actions, plain.actions)
+    assert refined.loss == plain.loss < plain.loss_before
+
+
+def test_the_configuration_makes_it_and_the_paper_does_not(task):
+    assert make_refinement(task, options=RefinementConfiguration(), most=40) is None
+    made = make_refinement(task, options=RefinementConfiguration(iterations=9, learning_rate=0.5, patience=3), most=40)
+    assert (made.optimizer.iterations, made.optimizer.learning_rate, made.optimizer.patience) == (9, 0.5, 3)
+    assert make_refinement(task, options=RefinementConfiguration(iterations=9), most=4).optimizer.iterations == 4
+    with_one = task.model_copy(update={"settings": {**task.settings, "refinement": {"iterations": 9}}})
+    assert with_task_settings(RunConfiguration(), with_one).refinement.iterations == 9
+    assert with_task_settings(RunConfiguration(algorithm="paper"), with_one).refinement.iterations == 0
