@@ -273,7 +273,9 @@ def test_deform_by_configuration(toy_task_file, toy_entry_points):
     with pytest.raises(InputError, match="Set device instead"):
         deform_configuration(bad, registry=registry)
     shifted = configuration.model_copy(update={"priorities": PrioritiesConfiguration(kind="displacement")})
-    with pytest.raises(InputError, match=r"transport solver toy has no option exponent\. Set it with --set priorities.kind=potential"):
+    with pytest.raises(
+        InputError, match=r"transport solver toy has no option exponent\. Set it with --set priorities.kind=potential"
+    ):
         deform_configuration(shifted, registry=registry)
 
 
