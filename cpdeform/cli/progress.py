@@ -68,7 +68,10 @@ class ProgressBar(Progress):
         self._stages = self._stages or task.stage_count
 
     def iteration_finished(self, stage: int, iteration: Iteration) -> None:
-        """Move the bar."""
+        """Move the bar; a refinement, whose length is its own, only changes the text."""
+        if iteration.phase != SEARCH:
+            self._progress.update(self._bar, description=f"stage {stage + 1} {iteration.phase}  {_losses(iteration)}")
+            return
         total = (self._stages or 1) * iteration.count
         self._progress.update(
             self._bar,

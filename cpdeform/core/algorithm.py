@@ -263,7 +263,7 @@ class Planner:
         return found
 
     def _refine(self, refinement: Refinement, index: int, state: State, candidate: PlacementResult, loss_before: float) -> _Refined:
-        """Refine a plan, and execute what was found if it is better by both objectives: the refinement's, and the stage's start."""
+        """Refine a plan, and execute what was found if the refinement's objective fell and the stage's is below its start's."""
         start = state.with_manipulators(candidate.placement.pose.unsqueeze(0))
         rest, notify = self.task.rest_steps, self._notifier(index)
         plans = refinement.refine(self.simulator, start, candidate.actions, rest_steps=rest, on_iteration=notify)

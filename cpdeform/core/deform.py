@@ -63,7 +63,8 @@ def deform(
         placer: A placer or a registered name; what the task's settings say where absent, or else ``"transport"``.
         objective: The loss; what the task's settings say where absent, or else the transport cost of the last step's particles
             to the goal.
-        optimizer: Finds actions; defaults to `TrajectoryOptimizer` with the task's settings.
+        optimizer: Finds actions; defaults to `TrajectoryOptimizer` with the task's settings. A refinement that these ask for makes
+            no more iterations than it, and none where `objective` is given.
         device: Where a simulator given by name runs, ``"cpu"`` or ``"cuda"``.
         seed: Seed of first actions and random placements.
         stages: Number of stages; the task's own where absent.
@@ -92,9 +93,11 @@ def deform(
     options = {"scene": task.scene, "batch_size": MAX_WORLDS, "device": device}
     used_simulator: Simulator = _part(simulator, "simulator", registry, **options)
     used_optimizer = optimizer or TrajectoryOptimizer(**defaults.optimizer.model_dump())
-    own_objective = objective is not None
+    refinement = None
+    # A loss given as an object is what the user wants lowered: no other one comes after it.
     if objective is None:
         objective = make_objective(task, ot_solver, used_simulator, options=defaults.objective, registry=registry)
+        refinement = make_refinement(task, options=defaults.refinement, most=used_optimizer.iterations)
     # A solver given as an object has a cost of its own; its potentials are priorities whatever the cost.
     kind: PriorityKind = defaults.priorities.kind if isinstance(ot_solver, str) else "potential"
     used_solver = _priorities_solver(ot_solver, defaults, registry=registry) if isinstance(ot_solver, str) else ot_solver
@@ -106,7 +109,7 @@ def deform(
         objective=objective,
         optimizer=used_optimizer,
         priority_kind=kind,
-        refinement=None if own_objective else make_refinement(task, options=defaults.refinement, most=used_optimizer.iterations),
+        refinement=refinement,
         seed=seed,
         observers=(*observers, HookObserver(registry.manager)),
         names=names,

@@ -25,7 +25,8 @@ class Stage:
         scene: The scene.
         state: The current state S_i, a single world.
         target: Goal particles G (M, 3), length units.
-        priorities: Transport priorities f (N,), cost units; nan where the placer declared that it needs none.
+        priorities: Transport priorities f (N,), cost or length units (see `transport_priorities`); nan where the
+            placer declared that it needs none.
         generator: Source of randomness on the CPU, seeded by the run.
         loss: Loss of leaving the state as it is, objective units; nan where it is unknown.
         failed_contacts: Contact particles of the candidates of all stages since the last one that gained at least `LEAST_GAIN`.

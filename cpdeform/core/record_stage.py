@@ -40,7 +40,13 @@ def write_stage(path: Path, result: StageResult) -> None:
             group = file.create_group(name)
             for field, (shape, units) in STATE_FIELDS.items():
                 write_dataset(group, field, getattr(state, field), shape=shape, units=units)
-        write_dataset(file, "priorities", result.priorities, shape="particle", units="transport cost (length for p = 1)")
+        write_dataset(
+            file,
+            "priorities",
+            result.priorities,
+            shape="particle",
+            units="transport cost of a potential (length for p = 1), length of a displacement",
+        )
         if result.candidates:
             _write_candidates(file.create_group("placements"), result.candidates)
         if result.actions is not None and result.positions is not None and result.manipulator_poses is not None:

@@ -55,7 +55,7 @@ class StageResult:
         status: How it ended; the state is unchanged unless it is `Status.FINISHED`.
         state_before: State S_i, a single world, tools as the stage found them.
         state: State S_{i+1} after the executed plan.
-        priorities: Transport priorities f (N,), cost units; nan where the placer needs none.
+        priorities: Transport priorities f (N,), cost or length units (see `transport_priorities`); nan where the placer needs none.
         candidates: Every placement tried and what became of it.
         best: Index of the executed candidate; None where none was executed.
         actions: Executed actions (T, A); None where none was executed.

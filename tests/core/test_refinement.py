@@ -7,9 +7,10 @@ import torch
 from cpdeform_toy.parts import OTSolverToy, PlacerToy
 from cpdeform_toy.simulator import SimulatorToy
 
+from cpdeform.cli import progress
 from cpdeform.core.algorithm import Planner
 from cpdeform.core.configuration import RefinementConfiguration, RunConfiguration, with_task_settings
-from cpdeform.core.deform import make_refinement
+from cpdeform.core.deform import deform, make_refinement
 from cpdeform.core.objective import ObjectiveAutograd
 from cpdeform.core.objectives.transport import ObjectiveTransport
 from cpdeform.core.optimizer import TrajectoryOptimizer
@@ -92,3 +93,23 @@ def test_the_configuration_makes_it_and_the_paper_does_not(task):
     with_one = task.model_copy(update={"settings": {**task.settings, "refinement": {"iterations": 9}}})
     assert with_task_settings(RunConfiguration(), with_one).refinement.iterations == 9
     assert with_task_settings(RunConfiguration(algorithm="paper"), with_one).refinement.iterations == 0
+
+
+def test_a_loss_given_as_an_object_is_not_followed_by_another(task):
+    with_one = task.model_copy(update={"settings": {**task.settings, "refinement": {"iterations": 9}}})
+    parts = {"simulator": SimulatorToy(task.scene, batch_size=4), "ot_solver": OTSolverToy(), "placer": PlacerToy()}
+    options = {**parts, "optimizer": TrajectoryOptimizer(iterations=2), "stages": 1}
+    (refined,) = deform(with_one, **options).stages
+    assert [iteration.phase for iteration in refined.history] == ["search"] * 2 + [REFINEMENT] * 2
+    (plain,) = deform(with_one, objective=Offset(goal(task)), **options).stages
+    assert [iteration.phase for iteration in plain.history] == ["search"] * 2
+
+
+def test_progress_tells_the_phase_and_the_bar_stays(task, monkeypatch, capsys):
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
+    bar = progress.ProgressBar(stages=1)
+    run(task, goal(task), observers=(progress.ProgressLines(), bar))
+    assert f"stage 1, refinement {ITERATIONS}/{ITERATIONS}, loss" in capsys.readouterr().err
+    (shown,) = bar._progress.tasks
+    assert (shown.completed, shown.total) == (2, 2)
+    assert shown.description.startswith("stage 1 refinement")

@@ -38,6 +38,8 @@ class ObjectiveTransport(Objective):
         coast_steps: Environment steps for which the particles are taken to go on as fast as in the last one. The loss then is the
             cost plus the mean distance that they would go. For p = 1 this bounds the cost after these steps from above, so that a
             shape which is right only in passing, at speed, is no minimum.
+        axis_scale: Factors of the coordinates x, y, z, dimensionless, before distances are taken. With (1, 4, 1) errors of height
+            count four times: clay that was raised may never come down again, so that a rise costs more than its distance.
         scene: Whose tools the contact term is about; required with a `contact_weight`.
 
     Raises:
