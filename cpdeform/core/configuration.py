@@ -159,6 +159,9 @@ class RunConfiguration(FrozenModel):
 def with_task_settings(configuration: RunConfiguration, task: Task) -> RunConfiguration:
     """Fill in, where the user set nothing, what the algorithm prescribes and then what the task's `settings` say.
 
+    A task's changes of its own scene are limits that a plan keeps to, such as slower tools; ``algorithm=paper`` has the scene as
+    it is.
+
     Args:
         configuration: What the user set; fields that were not set do not count.
         task: The task to be run.
@@ -172,6 +175,7 @@ def with_task_settings(configuration: RunConfiguration, task: Task) -> RunConfig
     if placer != base.get("placer", "transport"):
         base.pop("placer_options", None)
     if configuration.algorithm == "paper":
+        base.pop("scene", None)
         base = merge(base, PAPER_SETTINGS)
         if placer == "transport":
             base = merge(base, {"placer_options": PAPER_PLACER_OPTIONS})

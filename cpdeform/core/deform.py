@@ -56,7 +56,8 @@ def deform(
     """Plan how the tools of a task turn its body into its goal (paper, Algorithm 1).
 
     Args:
-        task: A task, a registered name, or the path of a YAML file.
+        task: A task, a registered name, or the path of a YAML file. Where both task and simulator are given by name, the limits that
+            the task's settings put on its tools count; a scene given as an object is used as it is.
         simulator: A simulator of the task's scene, or a registered name; ``"auto"`` is the fastest one that is installed.
         ot_solver: A transport solver or a registered name, or ``"auto"``; it gives the priorities and, unless `objective` is given,
             the loss.
@@ -85,8 +86,11 @@ def deform(
         simulator = registry.resolve("simulator", simulator, device=device)
     if isinstance(ot_solver, str):
         ot_solver = registry.resolve("ot_solver", ot_solver, device=device)
+    named = isinstance(task, str)
     task = load_task(task, registry=registry) if isinstance(task, str) else task
     defaults = with_task_settings(RunConfiguration(**({"placer": placer} if isinstance(placer, str) else {})), task)
+    if named and isinstance(simulator, str):
+        task = changed_task(task, scene=defaults.scene)
     placer = defaults.placer if placer is None else placer
     names = {"backend": _part_name(simulator), "ot": _part_name(ot_solver), "placer": _part_name(placer)}
     used_placer: Placer = _part(placer, "placer", registry, **defaults.placer_options)
@@ -241,12 +245,13 @@ def check_names(configuration: RunConfiguration, *, registry: Registry) -> None:
 
 
 def configured_task(configuration: RunConfiguration, *, registry: Registry) -> Task:
-    """Load a configuration's task and apply its changes of the scene, the goal and the number of steps.
+    """Load a configuration's task and apply the changes of the scene, the goal and the number of steps: its own and the user's.
 
     Raises:
         InputError: The task or a change cannot be used.
     """
     task = load_task(configuration.task, registry=registry)
+    configuration = with_task_settings(configuration, task)
     return changed_task(
         task,
         scene=configuration.scene,

@@ -46,6 +46,7 @@ class Task(FrozenModel):
         stage_count: Number of stages that the task is meant for.
         metric: What the result is judged by.
         settings: What a run of this task sets where the user does not: fields of `cpdeform.core.configuration.RunConfiguration`.
+            Its `scene` holds limits that plans keep to, such as slower tools; `scene` above stays the benchmark's.
     """
 
     name: str

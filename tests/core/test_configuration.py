@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from cpdeform.core.configuration import PAPER_PLACER_OPTIONS, RunConfiguration, with_task_settings
+from cpdeform.core.deform import configured_task, deform
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Stage
 from cpdeform.core.plugins import load_registry
@@ -45,6 +46,28 @@ def test_the_papers_algorithm_goes_above_the_tasks_settings(task):
     assert (found.optimizer.schedule, found.optimizer.iterations) == ("paper", 7)
     mine = RunConfiguration.model_validate({"algorithm": "paper", "optimizer": {"schedule": "halving"}})
     assert with_task_settings(mine, task).optimizer.schedule == "halving"
+
+
+def test_limits_of_the_tasks_tools_give_way_to_the_user_and_to_the_paper(make_toy_task):
+    limits = {"manipulators": {"0": {"action_scale": [0.004, 0.001, 0.004], "lower_bound": [0.0, 0.02, 0.0]}}}
+    path = make_toy_task(settings={"scene": limits})
+    own, registry = load_task(path).scene.manipulators[0], load_registry()
+
+    def tool(**options):
+        return configured_task(RunConfiguration(task=str(path), **options), registry=registry).scene.manipulators[0]
+
+    assert (tool().action_scale, tool().lower_bound) == ((0.004, 0.001, 0.004), (0.0, 0.02, 0.0))
+    mine = tool(scene={"manipulators": {"0": {"action_scale": [0.002, 0.002, 0.002]}}})
+    assert (mine.action_scale, mine.lower_bound) == ((0.002, 0.002, 0.002), (0.0, 0.02, 0.0))
+    assert tool(algorithm="paper") == own
+
+
+def test_limits_of_the_tasks_tools_count_in_python_where_all_is_named(make_toy_task):
+    limits = {"manipulators": {"0": {"lower_bound": [0.0, 0.02, 0.0]}}}
+    path = make_toy_task(settings={"scene": limits, "optimizer": {"iterations": 1}})
+    assert deform(str(path), stages=1).task.scene.manipulators[0].lower_bound == (0.0, 0.02, 0.0)
+    task = load_task(path)
+    assert deform(task, stages=1).task.scene == task.scene
 
 
 def test_unknown_settings_of_a_task_are_named(make_toy_task):
