@@ -56,8 +56,8 @@ def deform(
     """Plan how the tools of a task turn its body into its goal (paper, Algorithm 1).
 
     Args:
-        task: A task, a registered name, or the path of a YAML file. Where both task and simulator are given by name, the limits that
-            the task's settings put on its tools count; a scene given as an object is used as it is.
+        task: A task, a registered name, or the path of a YAML file. Where both task and simulator are given by name, the limits
+            that the task's settings put on its tools count; a scene given as an object is used as it is.
         simulator: A simulator of the task's scene, or a registered name; ``"auto"`` is the fastest one that is installed.
         ot_solver: A transport solver or a registered name, or ``"auto"``; it gives the priorities and, unless `objective` is given,
             the loss.
