@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -14,11 +16,12 @@ class Descent:
 
     A step too large presses the tools too deep, the next ones lift them off the clay. There the gradient is small or zero, and
     Adam's momentum carries the tools farther away. A world whose loss was not the lowest so far for `backtrack` steps in a row is
-    put back to its best plan, forgets its momentum and goes on from there with half the step size.
+    put back to its best plan, forgets its momentum and goes on from there with half the step size. So is one whose loss or gradient
+    is not finite, at once.
 
     Args:
         actions: First actions (B, T, A).
-        backtrack: Steps without a gain after which a world goes back; never where absent.
+        backtrack: Steps without a gain after which a world goes back; where absent never, not even a world that broke.
 
     References:
         .. [1] Kingma, Ba, "Adam: A Method for Stochastic Optimization", ICLR 2015.
@@ -37,19 +40,26 @@ class Descent:
         """Actions (b, T, A) of the worlds with the given indices (b,)."""
         return torch.stack([self._worlds[world].detach() for world in worlds.tolist()])
 
+    def can_return(self, worlds: Tensor) -> Tensor:
+        """Whether each of the worlds with the given indices (b,) has a plan to go back to, (b,)."""
+        return torch.tensor([world in self._best for world in worlds.tolist()], dtype=torch.bool)
+
     def step(self, worlds: Tensor, loss: Tensor, gradient: Tensor, *, learning_rate: float) -> None:
         """Take a step in each of the given worlds.
 
         Args:
             worlds: Indices (b,).
-            loss: Loss (b,) of their present actions, objective units.
+            loss: Loss (b,) of their present actions, objective units. It may be other than finite, as may the gradient, where a
+                world `can_return`.
             gradient: Its gradient (b, T, A).
             learning_rate: Adam's step size, in units of action.
         """
         self._adam.zero_grad()
         for world, value, slope in zip(worlds.tolist(), loss.tolist(), gradient, strict=True):
             self._worlds[world].grad = slope.to(self._worlds[world])
-            if self._backtrack is not None:
+            if not (math.isfinite(value) and bool(slope.isfinite().all())):
+                self._return(world)
+            elif self._backtrack is not None:
                 self._note(world, value, slope)
                 if self._idle[world] >= self._backtrack:
                     self._return(world)

@@ -83,8 +83,8 @@ class TrajectoryOptimizer:
         initial_noise: Standard deviation of the first actions about zero, so that seeds differ.
         schedule: ``"halving"`` drops the worse half of a batch's worlds again and again, so that a single one is left for the last
             half of the iterations (successive halving [1]_); ``"paper"`` gives all worlds all iterations.
-        backtrack: Iterations without a gain after which a world goes back to its best plan, with half the step size; never where
-            absent. See `cpdeform.core.descent.Descent`.
+        backtrack: Iterations without a gain after which a world goes back to its best plan, with half the step size, as it does at
+            once where its loss is not finite; never where absent. See `cpdeform.core.descent.Descent`.
 
     References:
         .. [1] Jamieson, Talwalkar, "Non-stochastic Best Arm Identification and Hyperparameter Optimization", AISTATS 2016.
@@ -136,8 +136,8 @@ class TrajectoryOptimizer:
             on_iteration: Called after each iteration.
 
         Returns:
-            The best plan of each world. A world whose loss or gradient is not finite, or that the schedule drops, keeps its best
-            plan so far and stops.
+            The best plan of each world. A world that the schedule drops keeps its best plan so far and stops, as does one whose
+            loss or gradient is not finite where it may not go back to a plan before.
         """
         count = state.batch_size
         best_actions = actions.detach().clone().to(state.position)
@@ -155,12 +155,13 @@ class TrajectoryOptimizer:
             gradient[:, gradient.shape[1] - rest_steps :] = 0.0
             evaluations += len(active)
             loss = torch.full_like(best_loss, torch.nan).index_copy(0, active, found)
-            finite[active] &= torch.isfinite(found) & torch.isfinite(gradient).flatten(1).all(dim=1).cpu()
+            sound = torch.isfinite(found) & torch.isfinite(gradient).flatten(1).all(dim=1).cpu()
+            finite[active] &= sound
+            going = sound | descent.can_return(active)
             better = torch.isfinite(loss) & (loss < best_loss)
             best_loss = torch.where(better, loss, best_loss)
             best_actions[better.to(tried.device)] = tried[better[active].to(tried.device)]
             start = time.perf_counter()
-            going = finite[active]
             kept = going.to(gradient.device)
             descent.step(active[going], found[going], gradient[kept], learning_rate=self.learning_rate)
             seconds["optimizer"] = time.perf_counter() - start
@@ -171,7 +172,7 @@ class TrajectoryOptimizer:
             improved = best_loss < torch.where(torch.isfinite(reference), reference - self.tolerance * reference.abs(), reference)
             reference = torch.where(improved, best_loss, reference)
             since_improvement = 0 if bool(improved.any()) else since_improvement + 1
-            survivors = self._survivors(active[finite[active]], best_loss, index + 1)
+            survivors = self._survivors(active[going], best_loss, index + 1)
             if since_improvement >= self.patience or not len(survivors):
                 break
             if len(survivors) < len(active):

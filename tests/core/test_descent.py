@@ -78,3 +78,13 @@ def test_a_world_that_never_touched_stays():
     for _ in range(3):
         descent.step(worlds, torch.tensor([1.0]), torch.zeros(1, 2, 3), learning_rate=0.3)
     torch.testing.assert_close(descent.actions(worlds), torch.full((1, 2, 3), 0.2))
+
+
+def test_a_world_that_breaks_goes_back_at_once():
+    descent, worlds = Descent(torch.zeros(1, 1, 1), backtrack=4), torch.tensor([0])
+    assert descent.can_return(worlds).tolist() == [False]
+    descent.step(worlds, torch.tensor([1.0]), -torch.ones(1, 1, 1), learning_rate=0.3)
+    assert descent.can_return(worlds).tolist() == [True]
+    for loss, slope, expected in ((float("nan"), 0.0, 0.15), (0.5, float("nan"), 0.075)):
+        descent.step(worlds, torch.tensor([loss]), torch.full((1, 1, 1), slope), learning_rate=0.3)
+        torch.testing.assert_close(descent.actions(worlds), torch.full((1, 1, 1), expected))

@@ -95,6 +95,24 @@ def test_a_world_that_breaks_keeps_its_best_and_the_others_go_on(toy_task_file):
     assert losses[:, 0].isnan().any()
 
 
+def test_a_world_that_breaks_goes_on_from_its_best_plan(toy_task_file):
+    """Steps of 0.2 break at the third one; halved again and again they come close to where the world breaks."""
+    simulator = SimulatorToy(load_task(toy_task_file).scene, batch_size=1, break_above=0.55)
+    state = simulator.initial_state()
+
+    def reached(backtrack):
+        optimizer = TrajectoryOptimizer(iterations=30, learning_rate=0.2, backtrack=backtrack)
+        return optimizer.minimize(simulator, state, zeros(1), Distance(goal(state, [0.4, 0.0, 0.0])))
+
+    stopped, back = reached(None), reached(4)
+    assert torch.stack([iteration.loss for iteration in stopped.history]).isnan().sum() == 1
+    assert torch.stack([iteration.loss for iteration in back.history]).isnan().sum() > 1
+    assert float(stopped.actions[0, :, 0].max()) < 0.45
+    assert 0.54 < float(back.actions[0, :, 0].max()) <= 0.55
+    assert float(back.loss) < float(stopped.loss)
+    assert not bool(back.finite)
+
+
 def test_all_worlds_broken_from_the_start(toy_task_file):
     simulator = SimulatorToy(load_task(toy_task_file).scene, batch_size=2, break_above=-1.0)
     state = simulator.initial_state()
