@@ -21,7 +21,6 @@ PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType(
     {
         "optimizer": {"schedule": "paper", "backtrack": None},
         "objective": {"axis_scale": (1.0, 1.0, 1.0), "coast_steps": 0.0},
-        "priorities": {"kind": "potential"},
         "refinement": {"iterations": 0},
     }
 )
@@ -160,7 +159,7 @@ def with_task_settings(configuration: RunConfiguration, task: Task) -> RunConfig
     """Fill in, where the user set nothing, what the algorithm prescribes and then what the task's `settings` say.
 
     A task's changes of its own scene are limits that a plan keeps to, such as slower tools; ``algorithm=paper`` has the scene as
-    it is.
+    it is, and the default priorities.
 
     Args:
         configuration: What the user set; fields that were not set do not count.
@@ -175,7 +174,8 @@ def with_task_settings(configuration: RunConfiguration, task: Task) -> RunConfig
     if placer != base.get("placer", "transport"):
         base.pop("placer_options", None)
     if configuration.algorithm == "paper":
-        base.pop("scene", None)
+        for field in ("scene", "priorities"):
+            base.pop(field, None)
         base = merge(base, PAPER_SETTINGS)
         if placer == "transport":
             base = merge(base, {"placer_options": PAPER_PLACER_OPTIONS})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cpdeform.core.configuration import PAPER_PLACER_OPTIONS, RunConfiguration, with_task_settings
+from cpdeform.core.configuration import PAPER_PLACER_OPTIONS, PrioritiesConfiguration, RunConfiguration, with_task_settings
 from cpdeform.core.deform import configured_task, deform
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Stage
@@ -19,6 +19,7 @@ def task(make_toy_task):
     settings = {
         "optimizer": {"iterations": 7, "learning_rate": 0.05},
         "objective": {"kind": "plasticinelab"},
+        "priorities": {"kind": "displacement", "blur": 0.02},
         "placer_options": {"poses": ["current"], "attempts": 2},
     }
     return load_task(make_toy_task(settings=settings))
@@ -44,6 +45,7 @@ def test_the_papers_algorithm_goes_above_the_tasks_settings(task):
     found = with_task_settings(RunConfiguration(algorithm="paper"), task)
     assert found.placer_options == dict(PAPER_PLACER_OPTIONS)
     assert (found.optimizer.schedule, found.optimizer.iterations) == ("paper", 7)
+    assert found.priorities == PrioritiesConfiguration()
     mine = RunConfiguration.model_validate({"algorithm": "paper", "optimizer": {"schedule": "halving"}})
     assert with_task_settings(mine, task).optimizer.schedule == "halving"
 
