@@ -142,6 +142,7 @@ class TrajectoryOptimizer:
         count = state.batch_size
         best_actions = actions.detach().clone().to(state.position)
         descent = Descent(best_actions, backtrack=self.backtrack)
+        best_ends = state.position.detach().clone()
         best_loss = torch.full((count,), torch.inf, dtype=torch.float64)
         reference = best_loss.clone()
         finite = torch.ones(count, dtype=torch.bool)
@@ -151,7 +152,8 @@ class TrajectoryOptimizer:
         for index in range(self.iterations):
             gauge = _gauge(simulator) if index == min(1, self.iterations - 1) else None
             tried = descent.actions(active)
-            found, gradient, seconds = _evaluate(simulator, _worlds(state, active), tried, objective, gauge)
+            stand_ins = best_ends[active.to(best_ends.device)]
+            found, gradient, ends, seconds = _evaluate(simulator, _worlds(state, active), tried, objective, stand_ins, gauge)
             gradient[:, gradient.shape[1] - rest_steps :] = 0.0
             evaluations += len(active)
             loss = torch.full_like(best_loss, torch.nan).index_copy(0, active, found)
@@ -161,6 +163,7 @@ class TrajectoryOptimizer:
             better = torch.isfinite(loss) & (loss < best_loss)
             best_loss = torch.where(better, loss, best_loss)
             best_actions[better.to(tried.device)] = tried[better[active].to(tried.device)]
+            best_ends[better.to(ends.device)] = ends[better[active].to(ends.device)]
             start = time.perf_counter()
             kept = going.to(gradient.device)
             descent.step(active[going], found[going], gradient[kept], learning_rate=self.learning_rate)
@@ -208,25 +211,34 @@ def _memory_use(simulator: Simulator, actions: Tensor, gauge: MemoryGauge) -> Me
 
 
 def _evaluate(
-    simulator: Simulator, state: State, actions: Tensor, objective: Objective, gauge: MemoryGauge | None
-) -> tuple[Tensor, Tensor, dict[str, float]]:
-    """Loss (B,) in float64 on the CPU, gradient (B, T, A) and wall times of one evaluation; a gauge leaves out the objective."""
+    simulator: Simulator, state: State, actions: Tensor, objective: Objective, stand_ins: Tensor, gauge: MemoryGauge | None
+) -> tuple[Tensor, Tensor, Tensor, dict[str, float]]:
+    """One evaluation; a gauge leaves out the objective.
+
+    Returns:
+        Loss (B,) in float64 on the CPU, gradient (B, T, A), the particles' final positions (B, N, 3) and wall times. The objective
+        is asked about `stand_ins` (B, N, 3) where a world's rollout is not finite.
+    """
     marks = [time.perf_counter()]
     trajectory = simulator.rollout(state, actions)
     finite = torch.isfinite(trajectory.positions).flatten(1).all(dim=1)
     marks.append(time.perf_counter())
     with contextlib.nullcontext() if gauge is None else gauge.leave_out():
-        result = objective.evaluate(trajectory if bool(finite.all()) else _held(trajectory, state, finite))
+        result = objective.evaluate(trajectory if bool(finite.all()) else _held(trajectory, stand_ins, finite))
     marks.append(time.perf_counter())
     gradient = simulator.vjp(trajectory, result.grad_positions, result.grad_manipulators).actions
     marks.append(time.perf_counter())
     loss = torch.where(finite, result.loss.detach().double(), torch.nan).cpu()
     names = ("rollout", "objective", "vjp")
-    return loss, gradient, {name: marks[i + 1] - marks[i] for i, name in enumerate(names)}
+    ends = trajectory.positions[:, -1].detach().clone()
+    return loss, gradient, ends, {name: marks[i + 1] - marks[i] for i, name in enumerate(names)}
 
 
-def _held(trajectory: Trajectory, state: State, finite: Tensor) -> Trajectory:
-    """The trajectory with worlds that broke held at their start: an objective cannot be asked about nan."""
-    held = state.position.unsqueeze(1).expand_as(trajectory.positions)
+def _held(trajectory: Trajectory, stand_ins: Tensor, finite: Tensor) -> Trajectory:
+    """The trajectory with worlds that broke held where their best plan ends: an objective cannot be asked about nan.
+
+    They go on from that plan, and so does what the objective keeps for warm starts.
+    """
+    held = stand_ins.unsqueeze(1).expand_as(trajectory.positions)
     positions = torch.where(finite[:, None, None, None], trajectory.positions, held)
     return dataclasses.replace(trajectory, positions=positions, manipulator_poses=trajectory.manipulator_poses.nan_to_num())

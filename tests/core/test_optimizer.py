@@ -113,6 +113,31 @@ def test_a_world_that_breaks_goes_on_from_its_best_plan(toy_task_file):
     assert not bool(back.finite)
 
 
+class Watching(Distance):
+    """Remembers the final positions that it was asked about."""
+
+    def __init__(self, goal):
+        super().__init__(goal)
+        self.asked = []
+
+    def loss(self, positions, manipulator_poses):
+        self.asked.append(positions[:, -1].detach().clone())
+        return super().loss(positions, manipulator_poses)
+
+
+def test_the_objective_is_asked_about_the_best_end_where_a_world_breaks(toy_task_file):
+    """What it keeps for warm starts then fits the plan that the world goes back to."""
+    simulator = SimulatorToy(load_task(toy_task_file).scene, batch_size=1, break_above=0.55)
+    state = simulator.initial_state()
+    objective = Watching(goal(state, [0.4, 0.0, 0.0]))
+    result = TrajectoryOptimizer(iterations=8, learning_rate=0.2).minimize(simulator, state, zeros(1), objective)
+    losses = torch.cat([iteration.loss for iteration in result.history])
+    assert losses.isnan().any()
+    for index in losses.isnan().nonzero().flatten().tolist():
+        before = int(losses[:index].nan_to_num(torch.inf).argmin())
+        assert torch.equal(objective.asked[index], objective.asked[before])
+
+
 def test_all_worlds_broken_from_the_start(toy_task_file):
     simulator = SimulatorToy(load_task(toy_task_file).scene, batch_size=2, break_above=-1.0)
     state = simulator.initial_state()
