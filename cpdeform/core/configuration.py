@@ -26,10 +26,13 @@ PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType(
 )
 """What ``algorithm=paper`` sets where the user does not: Algorithm 1 to the letter."""
 
-PAPER_PLACER_OPTIONS: Mapping[str, Any] = MappingProxyType(
-    {"distance_scale": 1.0, "max_gap": None, "poses": None, "attempts": 1, "least_gain": 0.0}
+PAPER_PLACER_OPTIONS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "transport": MappingProxyType({"distance_scale": 1.0, "max_gap": None, "poses": None, "attempts": 1, "least_gain": 0.0}),
+        "random": MappingProxyType({"rounds": 1}),
+    }
 )
-"""Options of the placer ``transport`` with ``algorithm=paper``; poses: the placer's own, by the number of tools."""
+"""Options of placers with ``algorithm=paper``: a single contact point a stage; poses: the placer's own, by the number of tools."""
 
 
 class OptimizerConfiguration(FrozenModel):
@@ -177,6 +180,5 @@ def with_task_settings(configuration: RunConfiguration, task: Task) -> RunConfig
         for field in ("scene", "priorities"):
             base.pop(field, None)
         base = merge(base, PAPER_SETTINGS)
-        if placer == "transport":
-            base = merge(base, {"placer_options": PAPER_PLACER_OPTIONS})
+        base = merge(base, {"placer_options": PAPER_PLACER_OPTIONS.get(placer, {})})
     return validate(RunConfiguration, merge(base, given), source=f"task {task.name}: settings")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.placer import Placement, Placer, PlacerCapabilities, Stage
+from cpdeform.core.placer import Placement, PlacementResult, Placer, PlacerCapabilities, Stage
 from cpdeform.core.scene import Manipulator, Vector3
 from cpdeform.placement.grasp import TOOLS_PER_GRASP, GraspSearch
 from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulators
@@ -26,11 +26,13 @@ class PlacerRandom(Placer):
 
     Each candidate draws surface particles (see `surface_particles`) until the tool can be placed as near to one as
     collision allows, touching the body; its rotation is kept. Several tools are placed in pairs that face each other through
-    such a particle, along one of the three directions of `PlacerTransport`, drawn for each candidate.
+    such a particle, along one of the three directions of `PlacerTransport`, drawn for each candidate. Where none of them lowers
+    the loss, others are drawn.
 
     Args:
         candidates: Number of placements.
         attempts: Particles drawn for one placement before it is given up.
+        rounds: The most rounds of candidates in a stage.
         grid_size: Positions along each axis of every grid.
         refinements: Number of finer grids.
         clearance: Least distance between the tool and any particle, length units.
@@ -51,16 +53,19 @@ class PlacerRandom(Placer):
         *,
         candidates: int = 1,
         attempts: int = 20,
+        rounds: int = 3,
         grid_size: int = 20,
         refinements: int = 2,
         clearance: float = 0.0,
         margin: float | None = None,
         max_gap: float | None = 0.0005,
     ) -> None:
-        for name, number in (("candidates", candidates), ("attempts", attempts)):
+        for name, number in (("candidates", candidates), ("attempts", attempts), ("rounds", rounds)):
             if number < 1:
                 raise InputError(name, came=str(number), expected="at least 1")
-        self.candidates, self.attempts = candidates, attempts
+        self.candidates, self.attempts, self.rounds = candidates, attempts, rounds
+        self._stage: Stage | None = None
+        self._round = 0
         self.options = GridOptions(
             grid_size=grid_size, refinements=refinements, clearance=clearance, margin=margin, max_gap=max_gap
         )
@@ -71,6 +76,9 @@ class PlacerRandom(Placer):
         Raises:
             CapabilityError: The scene has no movable tool.
         """
+        if stage is not self._stage:
+            self._stage, self._round = stage, 0
+        self._round += 1
         movable = movable_manipulators(stage)
         surface = surface_particles(stage.state.position[0].detach())
         placements = []
@@ -83,6 +91,13 @@ class PlacerRandom(Placer):
             if placement is not None:
                 placements.append(placement)
         return placements
+
+    def tell(self, results: list[PlacementResult]) -> bool:
+        """Ask again as long as nothing lowered the loss and rounds are left."""
+        stage = self._stage
+        if stage is None:
+            return False
+        return all(not result.loss < stage.loss for result in results) and self._round < self.rounds
 
     def _draw_grasps(self, stage: Stage, movable: Sequence[int], surface: Tensor, label: str) -> Placement | None:
         particles = stage.state.position[0].detach()

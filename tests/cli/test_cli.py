@@ -246,6 +246,11 @@ def test_version():
     assert invoke("--version").stdout.strip() == f"cpdeform {__version__}"
 
 
+def test_the_package_runs_as_a_module():
+    finished = subprocess.run([sys.executable, "-m", "cpdeform", "--version"], capture_output=True, text=True, check=True)
+    assert finished.stdout.strip() == f"cpdeform {__version__}"
+
+
 @pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["--version"], ["tasks"]])
 def test_heavy_modules_are_not_imported(arguments):
     script = (

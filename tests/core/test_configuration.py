@@ -43,7 +43,8 @@ def test_options_of_the_tasks_placer_do_not_go_to_another_one(task):
 
 def test_the_papers_algorithm_goes_above_the_tasks_settings(task):
     found = with_task_settings(RunConfiguration(algorithm="paper"), task)
-    assert found.placer_options == dict(PAPER_PLACER_OPTIONS)
+    assert found.placer_options == dict(PAPER_PLACER_OPTIONS["transport"])
+    assert with_task_settings(RunConfiguration(algorithm="paper", placer="random"), task).placer_options == {"rounds": 1}
     assert (found.optimizer.schedule, found.optimizer.iterations) == ("paper", 7)
     assert found.priorities == PrioritiesConfiguration()
     mine = RunConfiguration.model_validate({"algorithm": "paper", "optimizer": {"schedule": "halving"}})

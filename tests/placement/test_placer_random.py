@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.placer import Placement, Stage
+from cpdeform.core.placer import Placement, PlacementResult, Stage
 from cpdeform.core.scene import BodyBox, BodySphere, ManipulatorSphere, Scene
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
@@ -45,6 +47,20 @@ def test_the_stages_generator_decides() -> None:
     assert len({placement.contact_particle for placement in first}) == 3
 
 
+def test_other_particles_are_drawn_until_one_lowers_the_loss() -> None:
+    here = dataclasses.replace(stage(), loss=1.0)
+    placer = PlacerRandom(rounds=3)
+    contacts = []
+    for again in (True, True, False):
+        placements = placer.ask(here)
+        contacts += [placement.contact_particle for placement in placements]
+        assert placer.tell([PlacementResult(placement, 1.0, torch.zeros(1, 3)) for placement in placements]) is again
+    assert len(set(contacts)) == 3
+    placements = placer.ask(dataclasses.replace(stage(), loss=1.0))
+    assert placer.tell([PlacementResult(placements[0], float("nan"), torch.zeros(1, 3), False)]) is True
+    assert placer.tell([PlacementResult(placements[0], 0.9, torch.zeros(1, 3))]) is False
+
+
 def test_surface_particles_are_those_near_the_faces() -> None:
     position = stage().state.position[0]
     surface = surface_particles(position)
@@ -72,7 +88,7 @@ def test_gives_up_where_nothing_can_be_touched() -> None:
     assert PlacerRandom(candidates=2, attempts=3).ask(here) == []
 
 
-@pytest.mark.parametrize("name", ["candidates", "attempts"])
+@pytest.mark.parametrize("name", ["candidates", "attempts", "rounds"])
 def test_options_are_checked(name: str) -> None:
     with pytest.raises(InputError, match=f"{name}: got 0"):
         PlacerRandom(**{name: 0})
