@@ -53,10 +53,11 @@ def _text(result: Evaluation) -> str:
     ]
     if result.paper_start is not None and result.paper_final is not None:
         kind = f"GeomLoss's schedule, blur {result.paper_blur:g}"
-        lines.append(f"    as the paper   {_change(result.paper_start, result.paper_final)}   ({kind})")
+        floor = "" if result.paper_floor is None else f", floor {result.paper_floor:.6f}"
+        lines.append(f"    as the paper   {_change(result.paper_start, result.paper_final)}   ({kind}{floor})")
     if result.exact_start is not None and result.exact_final is not None:
         lines.append(f"    exact          {_change(result.exact_start, result.exact_final)}   ({result.exact_method})")
-    reason = "the goal's particles are the body's" if result.corresponds else "two samples of the goal's shape"
+    reason = "the goal's particles are the body's" if result.corresponds else "a random sample of the goal's shape"
     lines.append(f"    floor          {result.sampling_floor:.6f}   ({reason})")
     return "\n".join(lines)
 

@@ -32,6 +32,7 @@ FIGURES = (
     "incremental_iou",
     "w1_paper_initial",
     "w1_paper_final",
+    "w1_paper_floor",
     "w1_paper_blur",
 )
 """Fields of a row that `judge` gives."""
@@ -55,13 +56,14 @@ class ExperimentRow:
         metric: Name of the task's metric.
         w1_initial: Converged W1 between start and goal, length units.
         w1_final: The same between the last state and the goal.
-        w1_floor: W1 between two samplings of the goal's shape with as many particles as the goal, what a perfect result would have;
-            0 where the goal's particles are those of the body.
+        w1_floor: W1 between the goal and a random sample of its shape with as many particles, what a perfect result would have; 0
+            where the goal's particles are those of the body.
         w1_converged: Whether both W1 were iterated to convergence.
         ratio_above_floor: (final - floor) / (initial - floor).
         incremental_iou: Normalised incremental IoU, in [0, 1].
         w1_paper_initial: W1 between start and goal with the paper's settings.
         w1_paper_final: The same between the last state and the goal.
+        w1_paper_floor: As `w1_floor`, with the paper's settings.
         w1_paper_blur: Entropic blur of both, length units.
         gradient_evaluations: Gradient evaluations of all stages and worlds.
         iterations: The most gradient evaluations per stage and world.
@@ -89,6 +91,7 @@ class ExperimentRow:
     incremental_iou: float | None = None
     w1_paper_initial: float | None = None
     w1_paper_final: float | None = None
+    w1_paper_floor: float | None = None
     w1_paper_blur: float | None = None
     gradient_evaluations: int | None = None
     iterations: int | None = None
@@ -235,6 +238,7 @@ def judge(record: RunRecord, *, paper_metric: bool) -> dict[str, Any]:
         "incremental_iou": found.incremental_iou,
         "w1_paper_initial": found.paper_start,
         "w1_paper_final": found.paper_final,
+        "w1_paper_floor": found.paper_floor,
         "w1_paper_blur": found.paper_blur,
     }
     return {name: to_json(figures[name]) for name in FIGURES}

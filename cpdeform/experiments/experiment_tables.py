@@ -35,12 +35,13 @@ COLUMNS: Mapping[str, tuple[str, str]] = {
     "w1_floor": ("W1 floor", ".5f"),
     "w1_paper_initial": ("paper's W1 initial", ".5f"),
     "w1_paper_final": ("paper's W1 final", ".5f"),
+    "w1_paper_floor": ("paper's W1 floor", ".5f"),
     "gradient_evaluations": ("gradient evaluations", "d"),
     "seconds": ("seconds", ".0f"),
 }
 """Title and format of the columns of the table of runs."""
 
-OPTIONAL_COLUMNS = ("w1_paper_initial", "w1_paper_final")
+OPTIONAL_COLUMNS = ("w1_paper_initial", "w1_paper_final", "w1_paper_floor")
 """Left out where no row has the figure."""
 
 FIGURES: Mapping[str, tuple[str, str]] = {
@@ -56,15 +57,15 @@ SHORT_TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
 """Which of them belong to an experiment; the paper's figures stand beside each."""
 
 NOTES = (
-    "W1: transport distance between particles and goal, converged, in edges of the domain; W1 floor: between two samplings of the "
-    "goal's shape, which a perfect result would have; ratio above floor: (final - floor) / (initial - floor), 0 is "
+    "W1: transport distance between particles and goal, converged, in edges of the domain; W1 floor: between the goal and a random "
+    "sample of its shape, which a perfect result would have; ratio above floor: (final - floor) / (initial - floor), 0 is "
     "perfect and 1 is the start. Gradient evaluations count every world: a stage of `cpdeform` shares its iterations out among its "
     "candidates by successive halving, `paper` gives each all of them, and `fixed` and `random` have a single one."
 )
 
 
 FLOOR_NOTE = (
-    "Some goals have another number of particles than the body. The floor is that of two samplings as large as the goal: with "
+    "Some goals have another number of particles than the body. The floor is that of a sample as large as the goal: with "
     "fewer particles than the goal a perfect result stays above it, and the ratio above the floor is too large."
 )
 
@@ -182,7 +183,7 @@ def short_table(rows: Sequence[ExperimentRow], figure: str, *, paper: PaperFigur
     methods = [method for method in METHODS if any(row.method == method for row in rows)]
     if all(getattr(row, figure) is None for row in rows):
         return ""
-    start = {"w1_final": ("w1_initial", "w1_floor"), "w1_paper_final": ("w1_paper_initial",)}.get(figure, ())
+    start = {"w1_final": ("w1_initial", "w1_floor"), "w1_paper_final": ("w1_paper_initial", "w1_paper_floor")}.get(figure, ())
     lines = []
     for task in dict.fromkeys(family(row.task) for row in rows):
         own = [row for row in rows if family(row.task) == task]
@@ -190,7 +191,7 @@ def short_table(rows: Sequence[ExperimentRow], figure: str, *, paper: PaperFigur
         before = [cell(statistics.fmean(values) if values else None, pattern) for values in known]
         means = [_mean([row for row in own if row.method == method], figure, pattern) for method in methods]
         lines.append([task, *before, *means, cell(paper.tasks.get(task), pattern)])
-    titles = {"w1_initial": "initial", "w1_paper_initial": "initial", "w1_floor": "floor"}
+    titles = {"w1_initial": "initial", "w1_paper_initial": "initial", "w1_floor": "floor", "w1_paper_floor": "floor"}
     return markdown(["task", *(titles[name] for name in start), *methods, "CPDeform in the paper"], lines)
 
 

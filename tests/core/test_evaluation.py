@@ -10,7 +10,7 @@ import torch
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.evaluation import evaluate, evaluate_record, exact_wasserstein, paper_wasserstein, sampling_floor
-from cpdeform.core.metrics import evaluate_metric, metric_solver
+from cpdeform.core.metrics import evaluate_metric, metric_solver, wasserstein
 from cpdeform.core.objectives.mass import mass_grid
 from cpdeform.core.objectives.metrics import incremental_iou
 from cpdeform.core.plugins import load_registry
@@ -18,6 +18,7 @@ from cpdeform.core.record import RunRecorder, load_record
 from cpdeform.core.sampling import sample_particles
 from cpdeform.core.target import load_correspondence, load_target, load_target_grid, write_target
 from cpdeform.core.task import load_task
+from cpdeform.tasks.solids import Block, Solid, fill_evenly
 
 needs_geomloss = pytest.mark.skipif(importlib.util.find_spec("geomloss") is None, reason="GeomLoss is not installed")
 needs_pot = pytest.mark.skipif(importlib.util.find_spec("ot") is None, reason="POT is not installed")
@@ -76,6 +77,7 @@ def test_all_distances(task, clouds):
     assert (result.wasserstein_blur, result.converged) == (1e-3, True)
     assert result.paper_blur == 1e-5  # the task is one of two stages
     assert 0.5 < result.paper_final / result.exact_final < 1.0
+    assert 0.5 < result.paper_floor / result.sampling_floor < 1.0
     assert evaluate(task, start=start, final=middle, target=target, paper=True, paper_blur=1e-3).paper_blur == 1e-3
     plain = evaluate(task, start=start, final=middle, target=target)
     assert (plain.paper_start, plain.paper_blur, plain.exact_final, plain.exact_method) == (None, None, None, None)
@@ -92,13 +94,21 @@ def test_exact_without_network_simplex(monkeypatch):
     assert "blur 0.0001" in method
 
 
-def test_sampling_floor_is_the_distance_of_two_samples():
-    generator = torch.Generator().manual_seed(1)
-    first, second = (torch.rand(1500, 3, generator=generator) * torch.tensor([0.3, 0.1, 0.3]) for _ in range(2))
+@pytest.mark.parametrize("kind", ["random", "even"])
+def test_sampling_floor_is_the_distance_of_a_random_sample(kind):
+    generator, count = torch.Generator().manual_seed(1), 1500
+    widths = torch.tensor([0.3, 0.1, 0.3], dtype=torch.float64)
+    sample, target = (torch.rand(count, 3, generator=generator, dtype=torch.float64) * widths for _ in range(2))
+    if kind == "even":
+        block = Block(lower=(0.0, 0.0, 0.0), upper=(0.3, 0.1, 0.3))
+        target = torch.as_tensor(fill_evenly(Solid(parts=(block,), origin=(0.0, 0.0, 0.0)), count))
     solver = metric_solver()
-    distance = float(solver.solve(first, second).value)
-    assert sampling_floor(first.double(), solver=solver) == pytest.approx(distance, rel=0.12)
-    assert math.isnan(sampling_floor(first[:1].double(), solver=solver))
+
+    def distance(first, second):
+        return float(wasserstein(first, second, solver=solver).value)
+
+    assert sampling_floor(target, distance=distance) == pytest.approx(distance(sample, target), rel=0.12)
+    assert math.isnan(sampling_floor(target[:1], distance=distance))
 
 
 def test_goals_that_share_the_particles_have_no_floor(task, clouds, tmp_path):

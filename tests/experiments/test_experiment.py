@@ -164,6 +164,7 @@ def test_the_papers_metric_and_figures_that_are_kept(copied, no_runs, monkeypatc
     assert invoke(*arguments).exit_code == 0
     (row,) = table()
     assert 0.0 < float(row["w1_paper_final"]) < float(row["w1_paper_initial"])
+    assert 0.0 < float(row["w1_paper_floor"]) < float(row["w1_floor"])
     text = (copied / "out" / "table.md").read_text()
     assert "paper's W1 final" in text
     assert "GeomLoss's default schedule, blur 1e-05" in text
