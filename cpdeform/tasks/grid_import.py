@@ -142,7 +142,16 @@ def choose_grid(grids: dict[str, NDArray[np.float64]], name: str | None, *, path
 
 
 def task_name(name: str) -> str | None:
-    """Name of the task whose goal a grid of PlasticineLab is, e.g. ``"move-v2"`` for ``"Move3D-v2"``; None where there is none."""
+    """Name of the task whose goal a grid of PlasticineLab is, e.g. ``"move-v2"`` for ``"Move3D-v2"``; None where there is none.
+
+    The three grids of ``Pinch3D`` are goals of ``"pinch"``, a task without variants.
+    """
+    goal = goal_name(name)
+    return "pinch" if goal is not None and goal.startswith("pinch-") else goal
+
+
+def goal_name(name: str) -> str | None:
+    """What `import_grids` calls the goal of a grid: the task's name, with the variant where PlasticineLab has several goals for it."""
     match = re.fullmatch(r"(.+?)(-v\d+)?", name)
     if match is None or match[1] not in PLASTICINELAB_NAMES:
         return None
@@ -204,7 +213,7 @@ def import_grids(
     registry: Registry | None = None,
     on_imported: Callable[[ImportedGrid], None] | None = None,
 ) -> list[ImportedGrid]:
-    """Make the goals of all grids of an archive: ``directory/<task name>.npz``.
+    """Make the goals of all grids of an archive: ``directory/<goal name>.npz``, see `goal_name`.
 
     Args:
         file: As for `read_grids`; its names are PlasticineLab's, see `PLASTICINELAB_NAMES`.
@@ -227,7 +236,7 @@ def import_grids(
         if task is None and names is not None:
             raise UnknownNameError("scene of PlasticineLab", name, PLASTICINELAB_NAMES)
         if task is not None:
-            jobs.append((name, load_task(task, registry=registry), directory / f"{task}.npz"))
+            jobs.append((name, load_task(task, registry=registry), directory / f"{goal_name(name)}.npz"))
     if not jobs:
         expected = "names of PlasticineLab's scenes, such as Move3D-v1"
         raise InputError(f"grid file {file}", came=f"grids named {', '.join(chosen[:5])}", expected=expected)

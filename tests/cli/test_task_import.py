@@ -12,7 +12,7 @@ from cpdeform.cli.main import app
 from cpdeform.core.objectives.mass import mass_grid
 from cpdeform.core.target import load_target, load_target_grid
 from cpdeform.core.task import load_task
-from cpdeform.tasks.grid_import import import_grids, task_name
+from cpdeform.tasks.grid_import import PLASTICINELAB_NAMES, goal_name, import_grids, task_name
 
 COUNT = 800
 
@@ -114,6 +114,12 @@ def test_names(directory, grid):
     assert invoke("single.npz", *common, "--overwrite").exit_code == 0
     names = {"Move3D-v3": "move-v3", "multistage_rope-v1": "rope++", "Rollingpin3D-v1": "rolling-pin-v1", "vase-v1": None}
     assert {name: task_name(name) for name in names} == names
+    assert {goal_name(f"Pinch3D-v{variant}") for variant in (1, 2, 3)} == {"pinch-v1", "pinch-v2", "pinch-v3"}
+
+
+@pytest.mark.parametrize("name", PLASTICINELAB_NAMES)
+def test_every_name_of_plasticinelab_has_a_task(name):
+    load_task(task_name(f"{name}-v1"))
 
 
 @pytest.mark.parametrize(
