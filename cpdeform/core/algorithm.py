@@ -23,7 +23,7 @@ from cpdeform.core.objective import Objective
 from cpdeform.core.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
 from cpdeform.core.ot import OTSolver
 from cpdeform.core.placer import LEAST_GAIN, Placement, PlacementResult, Placer, Stage
-from cpdeform.core.priorities import PriorityKind, transport_priorities
+from cpdeform.core.priorities import PriorityKind, transport_displacements, transport_priorities
 from cpdeform.core.refinement import Refinement, gained
 from cpdeform.core.result import DeformResult, Observer, StageResult, Status
 from cpdeform.core.scene import Scene
@@ -172,11 +172,13 @@ class Planner:
         still = still_trajectory(state, self.task.rollout_steps, scene=self.task.scene)
         loss_before = float(self.objective.begin(still).loss[0])
         # "priorities f = optimal-transport potentials between current shape S_i and goal G"
-        priorities = torch.full_like(state.position[0, :, 0], torch.nan)
+        priorities, displacements = torch.full_like(state.position[0, :, 0], torch.nan), None
         if self.placer.capabilities.needs_priorities:
-            priorities = transport_priorities(self.ot_solver.solve(state.position[0], target), kind=self.priority_kind)
+            transport = self.ot_solver.solve(state.position[0], target)
+            priorities = transport_priorities(transport, kind=self.priority_kind)
+            displacements = transport_displacements(transport) if self.priority_kind == "displacement" else None
         clock.lap("transport")
-        stage = Stage(index, self.task.scene, state, target, priorities, generator, loss_before, failed)
+        stage = Stage(index, self.task.scene, state, target, priorities, generator, loss_before, failed, displacements)
         candidates: list[PlacementResult] = []
         history: list[Iteration] = []
         evaluations = 0

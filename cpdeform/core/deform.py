@@ -20,6 +20,7 @@ from cpdeform.core.metrics import target_mass_grid
 from cpdeform.core.objective import Objective
 from cpdeform.core.objectives.density import ObjectiveDensity
 from cpdeform.core.objectives.plasticinelab import ObjectivePlasticineLab, mass_grid
+from cpdeform.core.objectives.soft_iou import ObjectiveSoftIoU
 from cpdeform.core.objectives.transport import ObjectiveTransport
 from cpdeform.core.optimizer import TrajectoryOptimizer
 from cpdeform.core.ot import OTSolver
@@ -305,7 +306,7 @@ def make_refinement(task: Task, *, options: RefinementConfiguration, most: int) 
 
     Args:
         task: Its target is the goal, with the node masses of its file where it has them.
-        options: Iterations, step size, patience.
+        options: Kind, iterations, step size, patience.
         most: The most iterations, whatever the options say; those of the search.
     """
     iterations = min(options.iterations, most)
@@ -313,6 +314,6 @@ def make_refinement(task: Task, *, options: RefinementConfiguration, most: int) 
         return None
     grid = target_mass_grid(task, torch.as_tensor(task.load_target()).double())
     return Refinement(
-        objective=ObjectiveDensity(task.scene, grid),
-        optimizer=TrajectoryOptimizer(**(options.model_dump() | {"iterations": iterations})),
+        objective=ObjectiveSoftIoU(task.scene, grid) if options.kind == "iou" else ObjectiveDensity(task.scene, grid),
+        optimizer=TrajectoryOptimizer(iterations=iterations, learning_rate=options.learning_rate, patience=options.patience),
     )

@@ -30,6 +30,7 @@ class Stage:
         generator: Source of randomness on the CPU, seeded by the run.
         loss: Loss of leaving the state as it is, objective units; nan where it is unknown.
         failed_contacts: Contact particles of the candidates of all stages since the last one that gained at least `LEAST_GAIN`.
+        displacements: Where transport moves each particle (N, 3), length units; None where the priorities are potentials.
     """
 
     index: int
@@ -40,6 +41,7 @@ class Stage:
     generator: torch.Generator
     loss: float = float("nan")
     failed_contacts: tuple[int, ...] = ()
+    displacements: Tensor | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -44,6 +44,16 @@ def transport_priorities(result: OTResult, *, kind: PriorityKind = "potential") 
         raise InputError("kind", came=f'"{kind}"', expected="one of " + ", ".join(get_args(PriorityKind)))
     if kind == "potential":
         return result.source_potential
+    distance: Tensor = torch.linalg.vector_norm(transport_displacements(result), dim=-1)
+    return distance
+
+
+def transport_displacements(result: OTResult) -> Tensor:
+    """Where transport of the cost |x - y|^2 moves the source particles, T(x_i) - x_i (N, 3), length units.
+
+    Raises:
+        InputError: The result is not one of the squared distance.
+    """
     if result.exponent != DISPLACEMENT_EXPONENT:
         raise InputError(
             "result",
@@ -51,6 +61,4 @@ def transport_priorities(result: OTResult, *, kind: PriorityKind = "potential") 
             expected="one of |x - y|^2, whose gradient is the displacement",
             remedy="Give the solver exponent=2, or take the potentials.",
         )
-    count = result.source_gradient.shape[0]
-    distance: Tensor = torch.linalg.vector_norm(result.source_gradient, dim=-1)
-    return distance * (count / DISPLACEMENT_EXPONENT)
+    return result.source_gradient * (-result.source_gradient.shape[0] / DISPLACEMENT_EXPONENT)

@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Manipulator
 from cpdeform.placement.pose import turned
-from cpdeform.placement.tool import surface_points, tool_half_extents
+from cpdeform.placement.tool import placed_surface, tool_half_extents
 from cpdeform.placement.touch import exit_distances
 
 LATERAL_REACH = 0.9
@@ -71,7 +70,7 @@ class GraspSearch:
         Returns:
             The grasp; None where no line has room for all tools within their bounds.
         """
-        points = torch.cat([self.particles, *(self._surface(index, poses[index]) for index in obstacles)])
+        points = torch.cat([self.particles, *(placed_surface(self.manipulators[index], poses[index]) for index in obstacles)])
         quaternions = [turned(self.manipulators[index], direction) for index in tools]
         half = tool_half_extents(self.manipulators[tools[0]], quaternions[0])
         across = torch.eye(3).to(direction)[direction.abs() < 0.5]
@@ -127,10 +126,6 @@ class GraspSearch:
         upper = along.new_tensor([self.manipulators[index].upper_bound for index in tools]).amin(dim=0)
         free = along.abs() > 0.5
         return lower.masked_fill(free, -torch.inf), upper.masked_fill(free, torch.inf)
-
-    def _surface(self, index: int, pose: Tensor) -> Tensor:
-        """Points (P, 3) all over another tool's surface."""
-        return rotate(pose[3:7], surface_points(self.manipulators[index], resolution=24).to(pose)) + pose[:3]
 
 
 def _lines(center: Tensor, across: Tensor, width: Tensor, count: int) -> Tensor:

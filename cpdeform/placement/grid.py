@@ -13,7 +13,7 @@ from cpdeform.core.placer import Stage
 from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Manipulator
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.placement.tool import surface_points, tool_half_extents
+from cpdeform.placement.tool import placed_surface, surface_points, tool_half_extents
 from cpdeform.placement.touch import CHUNK_DISTANCES, reduce_distances, smallest_gaps
 
 
@@ -111,7 +111,7 @@ class ToolGrid:
         self._surface = surface_points(self.manipulator).to(poses)
         others = [other for other in range(len(stage.scene.manipulators)) if other != index] if obstacles is None else obstacles
         self._fixed = [(stage.scene.manipulators[other], poses[other]) for other in others]
-        clouds = [rotate(pose[3:7], surface_points(tool, resolution=24).to(poses)) + pose[:3] for tool, pose in self._fixed]
+        clouds = [placed_surface(tool, pose) for tool, pose in self._fixed]
         self._obstacles = torch.cat(clouds) if clouds else self.particles[:0]
 
     def pose_at(self, position: Tensor) -> Tensor:

@@ -22,10 +22,11 @@ GRASP_DIRECTIONS: Mapping[str, Vector3] = MappingProxyType(
 )
 """Axis along which the tools of a grasp face each other."""
 
-DIRECT, APART, CURRENT = "direct", "apart", "current"
-"""Candidates without a direction: the score alone places one tool; each tool at a contact point of its own; tools stay."""
+DIRECT, APART, CURRENT, PUSH = "direct", "apart", "current", "push"
+"""Candidates without an axis: the score alone places one tool; each tool at a contact point of its own; tools stay; each tool
+behind clay of its own, see `cpdeform.placement.push`."""
 
-POSE_NAMES = (*GRASP_DIRECTIONS, DIRECT, APART, CURRENT)
+POSE_NAMES = (*GRASP_DIRECTIONS, DIRECT, APART, CURRENT, PUSH)
 
 
 def check_poses(poses: Sequence[str] | None) -> tuple[str, ...] | None:

@@ -68,9 +68,9 @@ class Exploration:
                 exploration.explored[bodies == body] = False
         return exploration
 
-    def explore(self, contact: int) -> None:
-        """Count the surroundings of a particle as explored."""
-        self.explored |= self.near(contact, self.radius)
+    def explore(self, contact: int, *, radius: float | None = None) -> None:
+        """Count the surroundings of a particle, within `radius` (length units; the exploration's own if absent), as explored."""
+        self.explored |= self.near(contact, self.radius if radius is None else radius)
 
     def contact(self, body: int, *, excluded: Tensor | None = None) -> int | None:
         """The particle of a body with the largest priority that is neither explored nor excluded (N,); None where none is left."""

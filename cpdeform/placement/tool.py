@@ -69,3 +69,8 @@ def surface_points(manipulator: Manipulator, *, resolution: int = 12) -> Tensor:
     points = (points - distance.unsqueeze(-1) * gradient).detach()
     landed = local_distance(manipulator, *points.unbind(-1)).abs() < 1e-9
     return points[landed]
+
+
+def placed_surface(manipulator: Manipulator, pose: Tensor) -> Tensor:
+    """Points (P, 3) all over the surface of a tool with the given pose (8,), world frame, length units."""
+    return rotate(pose[3:7], surface_points(manipulator, resolution=24).to(pose)) + pose[:3]

@@ -13,8 +13,9 @@ from cpdeform.core.scene import Manipulator
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.placement.grasp import TOOLS_PER_GRASP, Cost, GraspSearch
 from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulators
-from cpdeform.placement.pose import APART, CURRENT, DIRECT, GRASP_DIRECTIONS, check_poses
+from cpdeform.placement.pose import APART, CURRENT, DIRECT, GRASP_DIRECTIONS, PUSH, check_poses
 from cpdeform.placement.priorities import Exploration
+from cpdeform.placement.push import Push, PushSearch
 from cpdeform.placement.tool import tool_half_extents
 from cpdeform.placement.touch import reduce_distances
 
@@ -23,6 +24,9 @@ EXPLORED_RADIUS = 2.0
 
 MOST_CONTACTS = 60
 """Contact points of a stage after which no further one is looked for."""
+
+PUSH_SPACING = 0.5
+"""Distance between the contact points of pushes, in that of other contact points: where exactly a push begins matters."""
 
 CURRENT_DEPTH = 1e-3
 """How deep a tool that stays where it is may reach into the body, length units."""
@@ -58,8 +62,10 @@ class PlacerTransport(Placer):
         max_gap: Largest distance between a single tool and the body beyond `clearance`, length units. The paper leaves this to
             the score, which pushes the tool off the body where priorities are negative; None does the same.
         poses: Candidates: ``"left-right"``, ``"top-bottom"``, ``"front-back"`` (along x, y, z), ``"direct"`` (a single tool,
-            its rotation kept), ``"apart"`` (every tool at a contact point of its own) and ``"current"`` (tools stay, unless they
-            reach into the body). Where absent ``"direct"`` for one movable tool, the first three for several.
+            its rotation kept), ``"apart"`` (every tool at a contact point of its own), ``"push"`` (every tool behind clay of
+            its own, on the side that it has to leave, see `PushSearch`; needs displacements as priorities) and ``"current"``
+            (tools stay, unless they reach into the body). Where absent ``"direct"`` for one movable tool, the first three for
+            several.
         attempts: The most rounds of candidates in a stage.
         contacts: Contact points proposed in one round.
         least_gain: Relative gain from which a stage counts as a success.
@@ -141,22 +147,29 @@ class PlacerTransport(Placer):
     def _round(self, exploration: Exploration, movable: Sequence[int], *, first: bool) -> list[Placement]:
         """Candidates around the next contact point, whose surroundings then count as explored."""
         stage, ranking = exploration.stage, exploration.ranking
-        body = ranking[exploration.attempt % len(ranking)]
-        contact = exploration.contact(body)
+        poses = self.poses or ((DIRECT,) if len(movable) == 1 else tuple(GRASP_DIRECTIONS))
+        if poses == (PUSH,):
+            found = self._pushes(exploration, movable)
+            # It has looked at all particles that are left.
+            exploration.attempt = exploration.attempt if found else MOST_CONTACTS
+            return found
+        contact = exploration.contact(ranking[exploration.attempt % len(ranking)])
         if contact is None:
             return []
-        found = []
-        for pose in self.poses or ((DIRECT,) if len(movable) == 1 else tuple(GRASP_DIRECTIONS)):
-            if pose == CURRENT:
-                found.append(_stay(stage) if first else None)
+        candidates: list[Placement | None] = []
+        for pose in poses:
+            if pose == PUSH:
+                candidates += self._pushes(exploration, movable)
+            elif pose == CURRENT:
+                candidates.append(_stay(stage) if first else None)
             elif pose in GRASP_DIRECTIONS:
-                found.append(self._grasps(exploration, movable, pose, contact))
+                candidates.append(self._grasps(exploration, movable, pose, contact))
             elif pose == APART or len(movable) > 1:
-                found.append(self._apart(exploration, movable, pose, contact))
+                candidates.append(self._apart(exploration, movable, pose, contact))
             else:
-                found.append(self._direct(exploration, movable[0], contact))
+                candidates.append(self._direct(exploration, movable[0], contact))
         exploration.explore(contact)
-        return [placement for placement in found if placement is not None]
+        return [placement for placement in candidates if placement is not None]
 
     def _cost(self, exploration: Exploration) -> Cost:
         """What the score loses, for tools at given positions."""
@@ -231,6 +244,42 @@ class PlacerTransport(Placer):
             costs.append(found[1])
         score = self._score(exploration, sum(costs) / len(costs))
         return Placement(pose=poses, score=score, label=label, contact_particle=contact)
+
+    def _pushes(self, exploration: Exploration, movable: Sequence[int]) -> list[Placement]:
+        """Every tool behind clay of its own, which then counts as explored; empty where there is no room for all of them."""
+        stage = exploration.stage
+        if stage.displacements is None:
+            raise InputError(
+                "poses",
+                came=f'"{PUSH}" without displacements',
+                expected="priorities from displacements",
+                remedy="Set them with --set priorities.kind=displacement.",
+            )
+        search = PushSearch(
+            manipulators=stage.scene.manipulators,
+            particles=stage.state.position[0].detach(),
+            displacements=stage.displacements,
+            distance_scale=self.distance_scale,
+            clearance=self.options.clearance,
+        )
+        poses = stage.state.manipulator_pose[0].detach().clone()
+        placed = [index for index in range(len(stage.scene.manipulators)) if index not in movable]
+        pushes: list[Push] = []
+        taken = exploration.explored.clone()
+        for index in movable:
+            push, pose = search.next(~taken), None
+            while push is not None and pose is None:
+                pose = search.place(push, poses, index, placed)
+                taken |= exploration.near(push.contact, exploration.radius)
+                push = push if pose is not None else search.next(~taken)
+            if push is None or pose is None:
+                return []
+            search.take_off(push)
+            poses[index], placed, pushes = pose, [*placed, index], [*pushes, push]
+        for push in pushes:
+            exploration.explore(push.contact, radius=PUSH_SPACING * exploration.radius)
+        score = sum(push.score for push in pushes) / len(pushes)
+        return [Placement(pose=poses, score=score, label=PUSH, contact_particle=pushes[0].contact)]
 
     def _contacts(self, exploration: Exploration, contact: int) -> Iterator[int]:
         """The contact point, then that of the next body in the ranking and so on; on each body away from those before."""

@@ -151,7 +151,7 @@ def task_name(name: str) -> str | None:
 
 
 def goal_name(name: str) -> str | None:
-    """What `import_grids` calls the goal of a grid: the task's name, with the variant where PlasticineLab has several goals for it."""
+    """What `import_grids` calls the goal of a grid: the task's name, with the variant of PlasticineLab's that it is of."""
     match = re.fullmatch(r"(.+?)(-v\d+)?", name)
     if match is None or match[1] not in PLASTICINELAB_NAMES:
         return None

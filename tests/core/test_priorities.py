@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.ot import OTSolver
-from cpdeform.core.priorities import transport_priorities
+from cpdeform.core.priorities import transport_displacements, transport_priorities
 from cpdeform.ot.geomloss import OTSolverGeomLoss
 from cpdeform.ot.pot import OTSolverPOT
 
@@ -41,8 +41,9 @@ def bent(points: Tensor) -> Tensor:
 
 def test_a_moved_cloud_is_displaced_by_its_shift(make: MakeSolver) -> None:
     points, shift = rod(), torch.tensor([0.03, 0.1, -0.02], dtype=torch.float64)
-    displacement = transport_priorities(make(blur=5e-3, exponent=2).solve(points, points + shift), kind="displacement")
-    assert torch.allclose(displacement, shift.norm().expand(len(points)), rtol=0.02)
+    result = make(blur=5e-3, exponent=2).solve(points, points + shift)
+    assert torch.allclose(transport_priorities(result, kind="displacement"), shift.norm().expand(len(points)), rtol=0.02)
+    assert torch.allclose(transport_displacements(result), shift.expand(len(points), 3), atol=2e-3)
 
 
 def test_displacement_is_zero_where_the_clay_stays(make: MakeSolver) -> None:
@@ -67,5 +68,7 @@ def test_displacement_needs_the_squared_distance() -> None:
     result = OTSolverPOT(blur=0.01).solve(rod()[::20], bent(rod())[::20])
     with pytest.raises(InputError, match=r"result: got a solution of the cost \|x - y\|\^1, .* Give the solver exponent=2"):
         transport_priorities(result, kind="displacement")
+    with pytest.raises(InputError, match="result: got a solution"):
+        transport_displacements(result)
     with pytest.raises(InputError, match='kind: got "distance"'):
         transport_priorities(dataclasses.replace(result, exponent=2), kind="distance")  # type: ignore[arg-type]

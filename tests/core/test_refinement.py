@@ -12,6 +12,8 @@ from cpdeform.core.algorithm import Planner
 from cpdeform.core.configuration import RefinementConfiguration, RunConfiguration, with_task_settings
 from cpdeform.core.deform import deform, make_refinement
 from cpdeform.core.objective import ObjectiveAutograd
+from cpdeform.core.objectives.density import ObjectiveDensity
+from cpdeform.core.objectives.soft_iou import ObjectiveSoftIoU
 from cpdeform.core.objectives.transport import ObjectiveTransport
 from cpdeform.core.optimizer import TrajectoryOptimizer
 from cpdeform.core.refinement import REFINEMENT, Refinement
@@ -90,6 +92,9 @@ def test_the_configuration_makes_it_and_the_paper_does_not(task):
     made = make_refinement(task, options=RefinementConfiguration(iterations=9, learning_rate=0.5, patience=3), most=40)
     assert (made.optimizer.iterations, made.optimizer.learning_rate, made.optimizer.patience) == (9, 0.5, 3)
     assert make_refinement(task, options=RefinementConfiguration(iterations=9), most=4).optimizer.iterations == 4
+    assert isinstance(made.objective, ObjectiveDensity)
+    iou = make_refinement(task, options=RefinementConfiguration(iterations=9, kind="iou"), most=40)
+    assert isinstance(iou.objective, ObjectiveSoftIoU)
     with_one = task.model_copy(update={"settings": {**task.settings, "refinement": {"iterations": 9}}})
     assert with_task_settings(RunConfiguration(), with_one).refinement.iterations == 9
     assert with_task_settings(RunConfiguration(algorithm="paper"), with_one).refinement.iterations == 0

@@ -34,12 +34,7 @@ class ObjectiveDensity(ObjectiveAutograd):
     """
 
     def __init__(self, scene: Scene, target_grid: Tensor | NDArray[Any]) -> None:
-        grid = torch.as_tensor(target_grid).detach().double()
-        if tuple(grid.shape) != (scene.grid_size,) * 3:
-            raise InputError("target_grid", came=f"shape {tuple(grid.shape)}", expected=f"shape {(scene.grid_size,) * 3}")
-        if not bool(torch.isfinite(grid).all()) or not float(grid.sum()) > 0.0:
-            raise InputError("target_grid", came="no mass or non-finite masses", expected="finite masses with a positive sum")
-        self.scene, self.target_grid = scene, grid
+        self.scene, self.target_grid = scene, check_target_grid(target_grid, scene)
 
     def loss(self, positions: Tensor, manipulator_poses: Tensor) -> Tensor:
         """Misplaced share (B,) of the mass at the last step of positions (B, T+1, N, 3); the tools do not count."""
@@ -47,3 +42,13 @@ class ObjectiveDensity(ObjectiveAutograd):
         target = self.target_grid.to(mass)
         misplaced: Tensor = (mass - target).abs().sum(dim=(-3, -2, -1)) / (2.0 * target.sum())
         return misplaced
+
+
+def check_target_grid(target_grid: Tensor | NDArray[Any], scene: Scene) -> Tensor:
+    """Node masses (G, G, G) of a goal in double precision; `InputError` where they do not fit the scene or hold no mass."""
+    grid = torch.as_tensor(target_grid).detach().double()
+    if tuple(grid.shape) != (scene.grid_size,) * 3:
+        raise InputError("target_grid", came=f"shape {tuple(grid.shape)}", expected=f"shape {(scene.grid_size,) * 3}")
+    if not bool(torch.isfinite(grid).all()) or not float(grid.sum()) > 0.0:
+        raise InputError("target_grid", came="no mass or non-finite masses", expected="finite masses with a positive sum")
+    return grid
