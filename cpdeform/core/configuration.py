@@ -28,7 +28,9 @@ PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType(
 
 PAPER_PLACER_OPTIONS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
-        "transport": MappingProxyType({"distance_scale": 1.0, "max_gap": None, "poses": None, "attempts": 1, "least_gain": 0.0}),
+        "transport": MappingProxyType(
+            {"distance_scale": 1.0, "max_gap": None, "poses": None, "attempts": 1, "contacts": 1, "least_gain": 0.0}
+        ),
         "random": MappingProxyType({"rounds": 1}),
     }
 )

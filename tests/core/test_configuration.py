@@ -20,7 +20,7 @@ def task(make_toy_task):
         "optimizer": {"iterations": 7, "learning_rate": 0.05},
         "objective": {"kind": "plasticinelab"},
         "priorities": {"kind": "displacement", "blur": 0.02},
-        "placer_options": {"poses": ["current"], "attempts": 2},
+        "placer_options": {"poses": ["current"], "attempts": 2, "contacts": 3},
     }
     return load_task(make_toy_task(settings=settings))
 
@@ -30,7 +30,7 @@ def test_the_task_fills_in_what_the_user_leaves_open(task):
     found = with_task_settings(asked, task)
     assert (found.optimizer.iterations, found.optimizer.learning_rate, found.optimizer.patience) == (3, 0.05, 15)
     assert found.objective.kind == "plasticinelab"
-    assert found.placer_options == {"poses": ["current"], "attempts": 1}
+    assert found.placer_options == {"poses": ["current"], "attempts": 1, "contacts": 3}
     assert with_task_settings(found, task) == found
 
 
@@ -49,6 +49,13 @@ def test_the_papers_algorithm_goes_above_the_tasks_settings(task):
     assert found.priorities == PrioritiesConfiguration()
     mine = RunConfiguration.model_validate({"algorithm": "paper", "optimizer": {"schedule": "halving"}})
     assert with_task_settings(mine, task).optimizer.schedule == "halving"
+
+
+@pytest.mark.parametrize("name", ["move", "move++", "rope++", "star", "table"])
+def test_no_option_of_a_task_is_left_under_the_papers_algorithm(name):
+    found = with_task_settings(RunConfiguration(algorithm="paper"), load_task(name))
+    assert found.placer_options == dict(PAPER_PLACER_OPTIONS["transport"])
+    assert found.refinement.iterations == 0
 
 
 def test_limits_of_the_tasks_tools_give_way_to_the_user_and_to_the_paper(make_toy_task):
