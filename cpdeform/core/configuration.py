@@ -94,17 +94,18 @@ class ObjectiveConfiguration(FrozenModel):
 
 
 class RefinementConfiguration(FrozenModel):
-    """How a stage's best plan is refined by the mass of the goal's grid nodes.
+    """How a stage's best plan is refined, by another objective than the one that found it.
 
     Attributes:
         kind: ``"density"``: the share of misplaced mass, see `cpdeform.core.objectives.density`; ``"iou"``: PlasticineLab's soft
-            IoU, see `cpdeform.core.objectives.soft_iou`.
+            IoU, see `cpdeform.core.objectives.soft_iou`; ``"transport"``: the transport cost of all particles as it is, without
+            what a task adds to it for the search (factors of the coordinates, coasting).
         iterations: The most gradient evaluations, and never more than the search's; 0 for no refinement.
         learning_rate: Adam's step size, in units of action.
         patience: Stop when nothing improved for this many iterations.
     """
 
-    kind: Literal["density", "iou"] = "density"
+    kind: Literal["density", "iou", "transport"] = "density"
     iterations: int = Field(default=0, ge=0)
     learning_rate: float = Field(default=0.03, gt=0.0)
     patience: int = Field(default=15, ge=1)

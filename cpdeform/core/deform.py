@@ -102,7 +102,15 @@ def deform(
     # A loss given as an object is what the user wants lowered: no other one comes after it.
     if objective is None:
         objective = make_objective(task, ot_solver, used_simulator, options=defaults.objective, registry=registry)
-        refinement = make_refinement(task, options=defaults.refinement, most=used_optimizer.iterations)
+        refinement = make_refinement(
+            task,
+            ot_solver,
+            used_simulator,
+            options=defaults.refinement,
+            blur=defaults.objective.blur,
+            most=used_optimizer.iterations,
+            registry=registry,
+        )
     # A solver given as an object has a cost of its own; its potentials are priorities whatever the cost.
     kind: PriorityKind = defaults.priorities.kind if isinstance(ot_solver, str) else "potential"
     used_solver = _priorities_solver(ot_solver, defaults, registry=registry) if isinstance(ot_solver, str) else ot_solver
@@ -191,7 +199,15 @@ def deform_configuration(
         objective=objective,
         optimizer=TrajectoryOptimizer(**configuration.optimizer.model_dump()),
         priority_kind=configuration.priorities.kind,
-        refinement=make_refinement(task, options=configuration.refinement, most=configuration.optimizer.iterations),
+        refinement=make_refinement(
+            task,
+            configuration.ot,
+            simulator,
+            options=configuration.refinement,
+            blur=configuration.objective.blur,
+            most=configuration.optimizer.iterations,
+            registry=registry,
+        ),
         seed=configuration.seed,
         observers=(*observers, HookObserver(registry.manager)),
         names={"backend": configuration.backend, "ot": configuration.ot, "placer": configuration.placer},
@@ -301,19 +317,38 @@ def make_objective(
     )
 
 
-def make_refinement(task: Task, *, options: RefinementConfiguration, most: int) -> Refinement | None:
+def make_refinement(
+    task: Task,
+    ot_solver: OTSolver | str,
+    simulator: Simulator,
+    *,
+    options: RefinementConfiguration,
+    blur: float,
+    most: int,
+    registry: Registry,
+) -> Refinement | None:
     """The refinement that a configuration describes; None for none.
 
     Args:
         task: Its target is the goal, with the node masses of its file where it has them.
+        ot_solver: As for `make_objective`; for the kind ``"transport"``.
+        simulator: Gives device and type.
         options: Kind, iterations, step size, patience.
+        blur: Entropic blur of the kind ``"transport"``, length units.
         most: The most iterations, whatever the options say; those of the search.
+        registry: Where the name is looked up.
     """
     iterations = min(options.iterations, most)
     if iterations == 0:
         return None
-    grid = target_mass_grid(task, torch.as_tensor(task.load_target()).double())
+    objective: Objective
+    if options.kind == "transport":
+        plain = ObjectiveConfiguration(points=None, blur=blur)
+        objective = make_objective(task, ot_solver, simulator, options=plain, registry=registry)
+    else:
+        grid = target_mass_grid(task, torch.as_tensor(task.load_target()).double())
+        objective = ObjectiveSoftIoU(task.scene, grid) if options.kind == "iou" else ObjectiveDensity(task.scene, grid)
     return Refinement(
-        objective=ObjectiveSoftIoU(task.scene, grid) if options.kind == "iou" else ObjectiveDensity(task.scene, grid),
+        objective=objective,
         optimizer=TrajectoryOptimizer(iterations=iterations, learning_rate=options.learning_rate, patience=options.patience),
     )

@@ -16,6 +16,7 @@ from cpdeform.core.objectives.density import ObjectiveDensity
 from cpdeform.core.objectives.soft_iou import ObjectiveSoftIoU
 from cpdeform.core.objectives.transport import ObjectiveTransport
 from cpdeform.core.optimizer import TrajectoryOptimizer
+from cpdeform.core.plugins import load_registry
 from cpdeform.core.refinement import REFINEMENT, Refinement
 from cpdeform.core.task import load_task
 
@@ -88,16 +89,39 @@ def test_a_plan_worse_than_leaving_the_shape_alone_is_dropped(task):
 
 
 def test_the_configuration_makes_it_and_the_paper_does_not(task):
-    assert make_refinement(task, options=RefinementConfiguration(), most=40) is None
-    made = make_refinement(task, options=RefinementConfiguration(iterations=9, learning_rate=0.5, patience=3), most=40)
+    simulator, registry = SimulatorToy(task.scene, batch_size=1), load_registry()
+
+    def make(most=40, **options):
+        options = RefinementConfiguration(**options)
+        return make_refinement(task, OTSolverToy(), simulator, options=options, blur=2e-3, most=most, registry=registry)
+
+    assert make() is None
+    made = make(iterations=9, learning_rate=0.5, patience=3)
     assert (made.optimizer.iterations, made.optimizer.learning_rate, made.optimizer.patience) == (9, 0.5, 3)
-    assert make_refinement(task, options=RefinementConfiguration(iterations=9), most=4).optimizer.iterations == 4
+    assert make(most=4, iterations=9).optimizer.iterations == 4
     assert isinstance(made.objective, ObjectiveDensity)
-    iou = make_refinement(task, options=RefinementConfiguration(iterations=9, kind="iou"), most=40)
-    assert isinstance(iou.objective, ObjectiveSoftIoU)
+    assert isinstance(make(iterations=9, kind="iou").objective, ObjectiveSoftIoU)
     with_one = task.model_copy(update={"settings": {**task.settings, "refinement": {"iterations": 9}}})
     assert with_task_settings(RunConfiguration(), with_one).refinement.iterations == 9
     assert with_task_settings(RunConfiguration(algorithm="paper"), with_one).refinement.iterations == 0
+
+
+def test_refinement_by_transport_has_nothing_that_a_task_adds_for_the_search(task):
+    """Its loss is that of the plain cost, and the plan that it leaves has a lower one."""
+    weights = {"axis_scale": [1.0, 4.0, 1.0], "coast_steps": 0.1}
+    settings = {"objective": weights, "refinement": {"kind": "transport", "iterations": ITERATIONS}}
+    with_both = task.model_copy(update={"settings": {**task.settings, **settings}})
+    parts = {"simulator": SimulatorToy(task.scene, batch_size=4), "ot_solver": OTSolverToy(), "placer": PlacerToy()}
+    optimizer = TrajectoryOptimizer(iterations=ITERATIONS, learning_rate=0.02)
+    (stage,) = deform(with_both, **parts, optimizer=optimizer, stages=1).stages
+    refined = [float(iteration.loss[0]) for iteration in stage.history if iteration.phase == REFINEMENT]
+    plain = ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene)
+    start = SimulatorToy(task.scene, batch_size=1)
+    found = stage.candidates[stage.best]
+    world = stage.state_before.with_manipulators(found.placement.pose.unsqueeze(0))
+    final = float(plain.evaluate(start.rollout(world, stage.actions.unsqueeze(0))).loss[0])
+    assert final == pytest.approx(min(refined), rel=1e-5)
+    assert final < refined[0]
 
 
 def test_a_loss_given_as_an_object_is_not_followed_by_another(task):
