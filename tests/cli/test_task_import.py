@@ -119,7 +119,7 @@ def test_names(directory, grid):
 
 @pytest.mark.parametrize("name", PLASTICINELAB_NAMES)
 def test_every_name_of_plasticinelab_has_a_task(name):
-    load_task(task_name(f"{name}-v1"))
+    assert load_task(task_name(f"{name}-v1")).name in {task_name(f"{name}-v1"), task_name(name)}
 
 
 @pytest.mark.parametrize(
