@@ -1,0 +1,1 @@
+"""From names and files to a plan and its record: configuration, the resolver, recording, resuming, evaluation."""
