@@ -9,14 +9,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cpdeform.core.deform import deform
     from cpdeform.core.hookspecs import PluginSpec, hookimpl
-    from cpdeform.core.optimizer import TrajectoryOptimizer
-    from cpdeform.core.result import Observer
     from cpdeform.core.scene import Scene
     from cpdeform.core.simulator import Simulator, differentiable_rollout
     from cpdeform.core.state import State
     from cpdeform.core.task import Task, load_task
+    from cpdeform.planning.optimizer import TrajectoryOptimizer
+    from cpdeform.planning.result import Observer
+    from cpdeform.run.deform import deform
 
 __version__ = "0.1.0"
 
@@ -37,14 +37,14 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     modules = {
-        "Observer": "cpdeform.core.result",
+        "Observer": "cpdeform.planning.result",
         "PluginSpec": "cpdeform.core.hookspecs",
         "Scene": "cpdeform.core.scene",
         "Simulator": "cpdeform.core.simulator",
         "State": "cpdeform.core.state",
         "Task": "cpdeform.core.task",
-        "TrajectoryOptimizer": "cpdeform.core.optimizer",
-        "deform": "cpdeform.core.deform",
+        "TrajectoryOptimizer": "cpdeform.planning.optimizer",
+        "deform": "cpdeform.run.deform",
         "differentiable_rollout": "cpdeform.core.simulator",
         "hookimpl": "cpdeform.core.hookspecs",
         "load_task": "cpdeform.core.task",

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from cpdeform.backends.warp.simulator import SimulatorWarp
-from cpdeform.core.testing import CheckError, Report
+from cpdeform.testing import CheckError, Report
 
 
 def assert_caught(report: Report, name: str) -> None:

@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 from cpdeform import Scene, TrajectoryOptimizer, deform, load_task
 from cpdeform.backends.warp.simulator import SimulatorWarp
 from cpdeform.cli.main import app
-from cpdeform.core.record import load_record
-from cpdeform.core.result import Status
 from cpdeform.core.target import write_target
 from cpdeform.ot.geomloss import OTSolverGeomLoss
 from cpdeform.ot.pot import OTSolverPOT
+from cpdeform.planning.result import Status
+from cpdeform.run.record import load_record
 from cpdeform.tasks.scripts import Leg, perform
 
 README = Path(__file__).resolve().parents[1] / "README.md"

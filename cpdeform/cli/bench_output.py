@@ -24,8 +24,8 @@ def report(
     as_json: bool,
 ) -> None:
     """Print what a bench found, as a table or as JSON; exit code 1 where no row has figures."""
-    from cpdeform.core.record_files import to_json
     from cpdeform.experiments.tables import describe_machine, describe_versions, machine_line
+    from cpdeform.run.record_files import to_json
 
     machine, versions = describe_machine(device=device), describe_versions(registry)
     if as_json:
@@ -107,9 +107,9 @@ def split_numbers(text: str, option: str) -> tuple[int, ...]:
 
 def check_device(device: str) -> None:
     """Raise `InputError` unless it is the name of a device; whether there is one is the backend's to say."""
-    from cpdeform.core.configuration import RunConfiguration
     from cpdeform.core.errors import InputError
     from cpdeform.core.task import validate
+    from cpdeform.run.configuration import RunConfiguration
 
     try:
         validate(RunConfiguration, {"device": device}, source="bench")

@@ -16,8 +16,8 @@ import typer
 if TYPE_CHECKING:
     import torch
 
-    from cpdeform.core.testing.golden import GoldenErrors
-    from cpdeform.core.testing.report import Report
+    from cpdeform.testing.golden import GoldenErrors
+    from cpdeform.testing.report import Report
 
 check = typer.Typer(no_args_is_help=True, help="Check a part that you wrote, or a backend against recorded rollouts.")
 
@@ -32,7 +32,7 @@ Device = Annotated[str, typer.Option(help="cpu or cuda.", metavar="NAME")]
 
 def _show(report: Report, name: str, *, as_json: bool) -> None:
     """Print a report; exit code 1 where a check failed."""
-    from cpdeform.core.record_files import to_json
+    from cpdeform.run.record_files import to_json
 
     if as_json:
         typer.echo(json.dumps(to_json({"name": name, **report.to_dict()})))
@@ -56,7 +56,7 @@ def check_simulator_command(
     Exit code 0: all passed; 1: a check failed; 2: unusable input.
     """
     from cpdeform.core.plugins import load_registry, split_options
-    from cpdeform.core.testing.simulator import check_simulator
+    from cpdeform.testing.simulator import check_simulator
 
     factory = load_registry().load("simulator", name)
     with _quietly(as_json):
@@ -71,7 +71,7 @@ def check_ot_solver_command(name: Name, settings: Settings = None, only: Only = 
     Exit code 0: all passed; 1: a check failed; 2: unusable input.
     """
     from cpdeform.core.plugins import load_registry, split_options
-    from cpdeform.core.testing.ot import check_ot_solver
+    from cpdeform.testing.ot import check_ot_solver
 
     with _quietly(as_json):
         report = check_ot_solver(load_registry().create("ot_solver", name, **split_options(settings or [])), only=only or [])
@@ -85,7 +85,7 @@ def check_placer_command(name: Name, settings: Settings = None, only: Only = Non
     Exit code 0: all passed; 1: a check failed; 2: unusable input.
     """
     from cpdeform.core.plugins import load_registry, split_options
-    from cpdeform.core.testing.placer import check_placer
+    from cpdeform.testing.placer import check_placer
 
     with _quietly(as_json):
         report = check_placer(load_registry().create("placer", name, **split_options(settings or [])), only=only or [])
@@ -117,9 +117,9 @@ def check_golden_command(
     """
     from cpdeform.core.errors import InputError
     from cpdeform.core.plugins import load_registry, split_options
-    from cpdeform.core.testing.golden import check_golden_file
-    from cpdeform.core.testing.golden_file import golden_files
     from cpdeform.experiments.golden_table import golden_command, golden_table
+    from cpdeform.testing.golden import check_golden_file
+    from cpdeform.testing.golden_file import golden_files
 
     if markdown is not None and not markdown.parent.is_dir():
         raise InputError("--markdown", came=str(markdown), expected="a file in a folder that exists")
@@ -147,7 +147,7 @@ def check_golden_command(
 
 
 def _plain(backend: str, result: GoldenErrors) -> dict[str, Any]:
-    from cpdeform.core.record_files import to_json
+    from cpdeform.run.record_files import to_json
 
     plain: dict[str, Any] = to_json({"backend": backend, **dataclasses.asdict(result)})
     return plain

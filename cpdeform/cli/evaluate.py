@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from cpdeform.core.evaluation import Evaluation
+    from cpdeform.run.evaluation import Evaluation
 
 
 def evaluate(
@@ -28,9 +28,9 @@ def evaluate(
 ) -> None:
     """Compute the figures that results are compared by, the same way for every method."""
     from cpdeform.core.errors import InputError
-    from cpdeform.core.evaluation import evaluate_record
-    from cpdeform.core.record import load_record
-    from cpdeform.core.record_files import to_json
+    from cpdeform.run.evaluation import evaluate_record
+    from cpdeform.run.record import load_record
+    from cpdeform.run.record_files import to_json
 
     if paper_blur is not None and not 0.0 < paper_blur < float("inf"):
         raise InputError("--paper-blur", came=f"{paper_blur}", expected="a positive length, such as 1e-3")

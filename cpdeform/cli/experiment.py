@@ -19,9 +19,9 @@ from cpdeform.core.errors import InputError
 
 if TYPE_CHECKING:
     from cpdeform.core.plugins import Registry
-    from cpdeform.core.result import Observer
     from cpdeform.experiments.experiment_plan import ExperimentSettings, PlannedRun
     from cpdeform.experiments.experiment_row import ExperimentRow
+    from cpdeform.planning.result import Observer
 
 
 class ExperimentName(enum.StrEnum):
@@ -232,8 +232,8 @@ def _row_line(row: ExperimentRow) -> str:
 
 def _report(name: str, rows: Sequence[ExperimentRow], settings: dict[str, Any], out: Path, *, as_json: bool) -> None:
     """Print the tables, or one JSON object; exit code 1 where no run has figures."""
-    from cpdeform.core.record_files import to_json
     from cpdeform.experiments.experiment_tables import TABLE_FILE, paper_figures, read_sessions, sorted_rows
+    from cpdeform.run.record_files import to_json
 
     if as_json:
         content = {

@@ -11,9 +11,9 @@ from rich import progress as rich_progress
 from rich.console import Console
 from torch import Tensor
 
-from cpdeform.core.optimizer import SEARCH, Iteration
-from cpdeform.core.result import Observer, StageResult
 from cpdeform.core.task import Task
+from cpdeform.planning.optimizer import SEARCH, Iteration
+from cpdeform.planning.result import Observer, StageResult
 
 SECONDS_BETWEEN_LINES = 15.0
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from cpdeform.core.configuration import RunConfiguration
     from cpdeform.core.plugins import Registry
-    from cpdeform.core.record import RunRecord, RunRecorder
-    from cpdeform.core.result import DeformResult, Observer
-    from cpdeform.core.resume import Resumption
+    from cpdeform.planning.result import DeformResult, Observer
+    from cpdeform.run.configuration import RunConfiguration
+    from cpdeform.run.record import RunRecord, RunRecorder
+    from cpdeform.run.resume import Resumption
 
 FLAGS = {
     "task": "TASK",
@@ -74,8 +74,8 @@ def run(
     """
     flags = (task, backend, ot, placer, device, seed, stages, steps, target, iterations)
     given = {field: value for field, value in zip(FLAGS, flags, strict=True) if value is not None}
-    from cpdeform.core.deform import check_names, configured_task, resolved
     from cpdeform.core.plugins import load_registry
+    from cpdeform.run.deform import check_names, configured_task, resolved
 
     configuration, resumption = _configure(given, settings or []), None
     registry = load_registry()
@@ -98,11 +98,11 @@ def run(
 
 def _configure(given: dict[str, Any], settings: list[str], record: RunRecord | None = None) -> RunConfiguration:
     """Build the configuration of ``--set`` and, above it, the flags given; of a record, if any, below them."""
-    from cpdeform.core.configuration import RunConfiguration
     from cpdeform.core.errors import InputError
     from cpdeform.core.plugins import split_options
-    from cpdeform.core.resume import resumed_values
     from cpdeform.core.task import merge, validate
+    from cpdeform.run.configuration import RunConfiguration
+    from cpdeform.run.resume import resumed_values
 
     values = split_options(settings)
     for field, value in given.items():
@@ -125,8 +125,8 @@ def _resume(
     """Read the record to go on from; the configuration of the new run is the record's under what is given."""
     from cpdeform.core.errors import InputError
     from cpdeform.core.plugins import split_options
-    from cpdeform.core.record import load_record
-    from cpdeform.core.resume import check_same_task, make_resumption
+    from cpdeform.run.record import load_record
+    from cpdeform.run.resume import check_same_task, make_resumption
 
     if out is not None and out.resolve() == directory.resolve():
         raise InputError("--out", came="the directory of --resume", expected="another one, for the record of the stages to come")
@@ -148,8 +148,8 @@ def _execute(
     silent: bool,
 ) -> tuple[DeformResult, Path]:
     """Run with record and progress; the cheap checks come first, and nothing is written before all are passed."""
-    from cpdeform.core.deform import configured_task, deform_configuration
-    from cpdeform.core.record import RunRecorder
+    from cpdeform.run.deform import configured_task, deform_configuration
+    from cpdeform.run.record import RunRecorder
 
     task = configured_task(configuration, registry=registry) if resumption is None else resumption.task
     task.load_target()
@@ -221,7 +221,7 @@ def _finished(result: DeformResult) -> int:
 def _summary(
     result: DeformResult, configuration: RunConfiguration, directory: Path, *, resumed_from: Path | None
 ) -> dict[str, Any]:
-    from cpdeform.core.record_files import to_json
+    from cpdeform.run.record_files import to_json
 
     memory = result.memory
     summary = {

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pluggy
 
 if TYPE_CHECKING:
-    from cpdeform.core.result import DeformResult, StageResult
+    from cpdeform.planning.result import DeformResult, StageResult
 
 hookspec = pluggy.HookspecMarker("cpdeform")
 hookimpl = pluggy.HookimplMarker("cpdeform")

@@ -45,7 +45,7 @@ class Task(FrozenModel):
             was pushed slides on, and a shape that is right only in passing is no result.
         stage_count: Number of stages that the task is meant for.
         metric: What the result is judged by.
-        settings: What a run of this task sets where the user does not: fields of `cpdeform.core.configuration.RunConfiguration`.
+        settings: What a run of this task sets where the user does not: fields of `cpdeform.run.configuration.RunConfiguration`.
             Its `scene` holds limits that plans keep to, such as slower tools; `scene` above stays the benchmark's.
     """
 

@@ -7,11 +7,11 @@ import itertools
 from collections.abc import Iterator
 from typing import Any
 
-from cpdeform.core.configuration import RunConfiguration
 from cpdeform.core.errors import InputError
 from cpdeform.core.memory import MemoryGauge
 from cpdeform.core.plugins import Registry, load_registry
 from cpdeform.experiments.worker import measured
+from cpdeform.run.configuration import RunConfiguration
 
 RUN = "cpdeform.experiments.bench_run:run"
 MEGABYTE = 1e6
@@ -129,8 +129,8 @@ def run(request: dict[str, Any]) -> dict[str, Any]:
         The fields of `MEASURED`: losses in objective units, wall time of the run and of its parts, the parts of an iteration as
         means over all iterations, peak memory in megabytes (1e6 bytes) above what the process held before.
     """
-    from cpdeform.core.deform import deform_configuration
-    from cpdeform.core.record_files import to_json
+    from cpdeform.run.deform import deform_configuration
+    from cpdeform.run.record_files import to_json
 
     configuration = RunConfiguration.model_validate(request)
     registry = load_registry()

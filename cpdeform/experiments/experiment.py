@@ -15,14 +15,8 @@ from pathlib import Path
 
 import torch
 
-from cpdeform.core.configuration import RunConfiguration
-from cpdeform.core.deform import deform_configuration
 from cpdeform.core.errors import CpdeformError, InputError, RecordError
 from cpdeform.core.plugins import Registry
-from cpdeform.core.record import RunRecorder
-from cpdeform.core.record_reader import RunRecord, load_record
-from cpdeform.core.result import Observer
-from cpdeform.core.resume import recorded_configuration
 from cpdeform.core.task import Task
 from cpdeform.experiments.experiment_plan import (
     BASELINE,
@@ -34,6 +28,12 @@ from cpdeform.experiments.experiment_plan import (
     configure,
 )
 from cpdeform.experiments.experiment_row import OVER, ExperimentRow, forget, forget_failure, note_failure, read_row
+from cpdeform.planning.result import Observer
+from cpdeform.run.configuration import RunConfiguration
+from cpdeform.run.deform import deform_configuration
+from cpdeform.run.record import RunRecorder
+from cpdeform.run.record_reader import RunRecord, load_record
+from cpdeform.run.resume import recorded_configuration
 
 Observe = Callable[[PlannedRun], AbstractContextManager[Sequence[Observer]]]
 """Gives the observers of a run, for as long as it goes on."""

@@ -9,11 +9,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from cpdeform.core.configuration import RunConfiguration, with_task_settings
-from cpdeform.core.deform import configured_task, resolved
 from cpdeform.core.errors import InputError, UnknownNameError
 from cpdeform.core.plugins import Registry
 from cpdeform.core.task import Task, changed_task, load_task, merge, validate
+from cpdeform.run.configuration import RunConfiguration, with_task_settings
+from cpdeform.run.deform import configured_task, resolved
 
 MULTI_STAGE, SINGLE_STAGE = "multi-stage", "single-stage"
 

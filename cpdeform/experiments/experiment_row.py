@@ -11,11 +11,11 @@ from typing import Any
 
 from cpdeform import __version__
 from cpdeform.core.errors import CpdeformError, InputError
-from cpdeform.core.record_files import replacing, to_json, write_json
-from cpdeform.core.record_reader import RunRecord, load_record
-from cpdeform.core.result import Status
-from cpdeform.core.resume import recorded_configuration
 from cpdeform.experiments.experiment_plan import PlannedRun
+from cpdeform.planning.result import Status
+from cpdeform.run.record_files import replacing, to_json, write_json
+from cpdeform.run.record_reader import RunRecord, load_record
+from cpdeform.run.resume import recorded_configuration
 
 EVALUATION_FILE, FAILURE_FILE = "evaluation.json", "failure.json"
 """Files beside a record: its figures, so that they need not be computed again, and why there is no record."""
@@ -224,7 +224,7 @@ def judge(record: RunRecord, *, paper_metric: bool) -> dict[str, Any]:
     Returns:
         The figures `FIGURES`, W1 in length units; None for one that was not asked for or is not finite.
     """
-    from cpdeform.core.evaluation import evaluate_record
+    from cpdeform.run.evaluation import evaluate_record
 
     if record.stages[0].index != 0:
         raise InputError(f"run record {record.directory}", came="a run that went on from another", expected="one from the start")

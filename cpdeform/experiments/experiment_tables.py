@@ -13,11 +13,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from cpdeform.core.record_files import replacing, to_json
 from cpdeform.experiments.experiment import family
 from cpdeform.experiments.experiment_plan import METHODS, MULTI_STAGE, OWN_OPTIONS, SINGLE_STAGE
 from cpdeform.experiments.experiment_row import ExperimentRow
 from cpdeform.experiments.tables import cell, machine_line, markdown
+from cpdeform.run.record_files import replacing, to_json
 
 TABLE_FILE, CSV_FILE, SESSIONS_FILE = "table.md", "table.csv", "experiment.json"
 
@@ -233,7 +233,7 @@ def _settings_lines(rows: Iterable[ExperimentRow]) -> list[str]:
 
 def _settings(row: ExperimentRow) -> dict[str, str]:
     """A run's settings that are not the default, by dotted name, and where its goal comes from."""
-    from cpdeform.core.configuration import RunConfiguration
+    from cpdeform.run.configuration import RunConfiguration
 
     defaults = dict(_flatten(RunConfiguration().model_dump(mode="json")))
     settings = {

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from cpdeform.core.plugins import Registry
-from cpdeform.core.testing.golden import COSINE_BOUND, NORM_BOUND, POSITION_BOUND, VELOCITY_BOUND, GoldenErrors
 from cpdeform.experiments.tables import cell, describe_machine, describe_versions, machine_line, markdown
+from cpdeform.testing.golden import COSINE_BOUND, NORM_BOUND, POSITION_BOUND, VELOCITY_BOUND, GoldenErrors
 
 HEADER = (
     "scene",

@@ -10,12 +10,12 @@ from typing import Annotated, Any
 
 import typer
 
-from cpdeform.core.configuration import RunConfiguration
-from cpdeform.core.deform import deform_configuration
 from cpdeform.core.plugins import Registry, load_registry
-from cpdeform.core.result import DeformResult
 from cpdeform.core.task import validate
 from cpdeform.experiments.tables import markdown
+from cpdeform.planning.result import DeformResult
+from cpdeform.run.configuration import RunConfiguration
+from cpdeform.run.deform import deform_configuration
 
 COLUMNS = ("task", "placer", "seed", "status", "loss initial", "loss final", "ratio", "metric", "evaluations", "seconds")
 

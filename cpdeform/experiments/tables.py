@@ -10,7 +10,7 @@ from typing import Any
 
 from cpdeform.core.machine import available_cores
 from cpdeform.core.plugins import Registry
-from cpdeform.core.record_files import environment
+from cpdeform.run.record_files import environment
 
 
 def markdown(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:

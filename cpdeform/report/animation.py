@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cpdeform.core.record import RunRecord
-from cpdeform.core.record_files import replacing
 from cpdeform.report.pictures import View, clay_colours, draw_scene, make_view, tool_surfaces
+from cpdeform.run.record import RunRecord
+from cpdeform.run.record_files import replacing
 
 FRAMES_PER_SECOND = 6
 HOLD_SECONDS = 1.0

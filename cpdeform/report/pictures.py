@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.record import RunRecord, load_record
-from cpdeform.core.record_files import replacing
-from cpdeform.core.result import StageResult, Status
+from cpdeform.planning.result import StageResult, Status
 from cpdeform.report.render import Array, Camera, fit_camera, render
 from cpdeform.report.shapes import tool_surface
+from cpdeform.run.record import RunRecord, load_record
+from cpdeform.run.record_files import replacing
 
 AZIMUTH = 28.0
 ELEVATION = 42.0

@@ -22,11 +22,11 @@ import torch
 from numpy.typing import NDArray
 
 from cpdeform.core.errors import InputError, UnknownNameError
-from cpdeform.core.objectives.mass import mass_grid
 from cpdeform.core.plugins import Registry, load_registry
 from cpdeform.core.scene import Scene
 from cpdeform.core.target import POSITION_SCALE, write_target
 from cpdeform.core.task import Task, load_task
+from cpdeform.planning.objectives.mass import mass_grid
 
 PLASTICINELAB_NAMES = {
     "Move3D": "move",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from backend_cases import BACKENDS, backend_class
 
-from cpdeform.core.testing import check_simulator
+from cpdeform.testing import check_simulator
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import pytest
 from backend_cases import BACKENDS, backend_class
 from golden import NAMES, golden_path
 
-from cpdeform.core.testing import check_golden_file
+from cpdeform.testing import check_golden_file
 
 FORWARD_ONLY = {"chopsticks-v2", "multistage_airplane-v1", "multistage_star-v1"}
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from cpdeform import __version__
 from cpdeform.cli.main import app
-from cpdeform.core.record import load_record
+from cpdeform.run.record import load_record
 
 PARTS = ["--backend", "toy", "--ot", "toy", "--placer", "toy", "--iterations", "3"]
 SECONDS_TO_WAIT = 60.0

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cpdeform.cli.main import app
-from cpdeform.core.record import load_record
+from cpdeform.run.record import load_record
 
 QUICK = ["--backend", "toy", "--ot", "toy", "--iterations", "2", "--stages", "1"]
 

@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 
 from cpdeform.backends.warp.simulator import SimulatorWarp
 from cpdeform.cli.main import app
-from cpdeform.core.deform import deform
-from cpdeform.core.optimizer import TrajectoryOptimizer
 from cpdeform.core.plugins import load_registry
-from cpdeform.core.record import load_record
 from cpdeform.core.scene import Scene
+from cpdeform.planning.optimizer import TrajectoryOptimizer
+from cpdeform.run.deform import deform
+from cpdeform.run.record import load_record
 
 PARTS = ["--backend", "toy", "--ot", "toy", "--placer", "toy", "--iterations", "3"]
 BOARD = {

@@ -9,9 +9,9 @@ from golden import SHARED
 from typer.testing import CliRunner
 
 from cpdeform.cli.main import app
-from cpdeform.core.objectives.mass import mass_grid
 from cpdeform.core.target import load_target, load_target_grid
 from cpdeform.core.task import load_task
+from cpdeform.planning.objectives.mass import mass_grid
 from cpdeform.tasks.grid_import import PLASTICINELAB_NAMES, goal_name, import_grids, task_name
 
 COUNT = 800

@@ -7,9 +7,9 @@ import types
 import pytest
 
 from cpdeform.core.errors import InputError, MissingExtraError, PluginError, UnknownNameError
-from cpdeform.core.hook_observer import HookObserver
 from cpdeform.core.hookspecs import PluginSpec, hookimpl
 from cpdeform.core.plugins import KINDS, load_registry, split_options
+from cpdeform.run.hook_observer import HookObserver
 
 
 def plugin(monkeypatch: pytest.MonkeyPatch, name: str, **attributes: object) -> importlib.metadata.EntryPoint:

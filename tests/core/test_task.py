@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import yaml
 
-from cpdeform.core.configuration import RunConfiguration
 from cpdeform.core.errors import InputError, PluginError, UnknownNameError
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.task import Task, list_variants, load_target, load_task, merge, read_task, validate
+from cpdeform.run.configuration import RunConfiguration
 
 
 def test_reads_a_task(toy_task_file):

@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 
 from cpdeform.cli.main import app
 from cpdeform.core.plugins import load_registry
-from cpdeform.core.record import load_record
 from cpdeform.experiments.experiment import evaluations_per_stage
 from cpdeform.experiments.experiment_plan import METHODS, TASKS, expand_tasks
 from cpdeform.experiments.experiment_row import ExperimentRow, without_directories
 from cpdeform.experiments.experiment_tables import csv_text, paper_figures, short_table, table_text
+from cpdeform.run.record import load_record
 
 QUICK = ["--backend", "toy", "--ot", "toy", "--iterations", "3", "--stages", "1"]
 

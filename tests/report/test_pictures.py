@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from cpdeform.core.deform import deform
 from cpdeform.core.errors import InputError
-from cpdeform.core.optimizer import TrajectoryOptimizer
 from cpdeform.core.plugins import load_registry
-from cpdeform.core.record import RunRecorder, load_record
 from cpdeform.core.scene import (
     ManipulatorBox,
     ManipulatorCapsule,
@@ -22,11 +19,14 @@ from cpdeform.core.scene import (
     ManipulatorTorus,
 )
 from cpdeform.core.signed_distance import signed_distance
+from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.report import draw_run
 from cpdeform.report.animation import draw_animation
 from cpdeform.report.pictures import draw_picture
 from cpdeform.report.render import fit_camera, render
 from cpdeform.report.shapes import tool_surface
+from cpdeform.run.deform import deform
+from cpdeform.run.record import RunRecorder, load_record
 
 TOOLS = [
     ManipulatorSphere(position=(0, 0, 0), radius=0.1),

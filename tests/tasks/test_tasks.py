@@ -12,15 +12,15 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from cpdeform.core.algorithm import check_tools_outside
 from cpdeform.core.errors import UnknownNameError
-from cpdeform.core.objectives.metrics import soft_iou
-from cpdeform.core.objectives.plasticinelab import mass_grid
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.sampling import body_index, sample_particles
 from cpdeform.core.state import initial_state
 from cpdeform.core.target import load_correspondence
 from cpdeform.core.task import Task, list_variants, load_task, task_path
+from cpdeform.planning.algorithm import check_tools_outside
+from cpdeform.planning.objectives.metrics import soft_iou
+from cpdeform.planning.objectives.plasticinelab import mass_grid
 from cpdeform.tasks import sculptures
 from cpdeform.tasks.make_targets import MAKERS, SHARE, agreement, chosen, make
 from cpdeform.tasks.plugin import TASKS

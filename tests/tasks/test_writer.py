@@ -8,13 +8,13 @@ import torch
 
 from cpdeform import load_task
 from cpdeform.backends.warp.simulator import SimulatorWarp
-from cpdeform.core.objectives.metrics import soft_iou
-from cpdeform.core.objectives.plasticinelab import mass_grid
 from cpdeform.core.sampling import sample_particles
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import manipulator_pose
 from cpdeform.core.target import POSITION_SCALE
 from cpdeform.core.task import Task
+from cpdeform.planning.objectives.metrics import soft_iou
+from cpdeform.planning.objectives.plasticinelab import mass_grid
 from cpdeform.tasks.single_stage import SINGLE_STAGE
 
 VARIANTS = ("v1", "v2", "v3", "v4", "v5")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cpdeform.core.testing import check_simulator
+from cpdeform.testing import check_simulator
 from cpdeform_example.simulator import SimulatorExample
 
 

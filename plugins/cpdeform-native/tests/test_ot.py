@@ -15,9 +15,9 @@ import cpdeform_native
 from cpdeform.core.errors import InputError, MissingExtraError
 from cpdeform.core.ot import weighted_median
 from cpdeform.core.plugins import load_registry
-from cpdeform.core.testing.ot import check_ot_solver
-from cpdeform.core.testing.ot_bench import cloud, cosine, pressed, random_weights
 from cpdeform.ot.divergence import Potentials, Problem
+from cpdeform.testing.ot import check_ot_solver
+from cpdeform.testing.ot_bench import cloud, cosine, pressed, random_weights
 from cpdeform_native.ot import OTSolverNative
 
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.ot import OTResult
-from cpdeform.core.testing.ot_bench import cloud, cosine, pressed
 from cpdeform.ot.divergence import Potentials, Problem
+from cpdeform.testing.ot_bench import cloud, cosine, pressed
 from cpdeform_native import _transport
 from cpdeform_native.ot import OrderedPotentials, OTSolverNative
 

@@ -1,0 +1,190 @@
+"""The configuration of a run: what the command line sets and the run record keeps."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+from pydantic import Field, PositiveFloat, field_validator
+
+from cpdeform.core.errors import InputError
+from cpdeform.core.plugins import AUTO
+from cpdeform.core.priorities import PriorityKind
+from cpdeform.core.scene import FrozenModel
+from cpdeform.core.task import Task, merge, validate
+from cpdeform.planning.objectives.contact import ContactKind
+
+PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType(
+    {
+        "optimizer": {"schedule": "paper", "backtrack": None},
+        "objective": {"axis_scale": (1.0, 1.0, 1.0), "coast_steps": 0.0},
+        "refinement": {"iterations": 0},
+    }
+)
+"""What ``algorithm=paper`` sets where the user does not: Algorithm 1 to the letter."""
+
+PAPER_PLACER_OPTIONS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "transport": MappingProxyType(
+            {"distance_scale": 1.0, "max_gap": None, "poses": None, "attempts": 1, "contacts": 1, "least_gain": 0.0}
+        ),
+        "random": MappingProxyType({"rounds": 1}),
+    }
+)
+"""Options of placers with ``algorithm=paper``: a single contact point a stage; poses: the placer's own, by the number of tools."""
+
+
+class OptimizerConfiguration(FrozenModel):
+    """Options of `cpdeform.planning.optimizer.TrajectoryOptimizer`; see there."""
+
+    iterations: int = Field(default=40, ge=1)
+    learning_rate: float = Field(default=0.1, gt=0.0)
+    patience: int = Field(default=15, ge=1)
+    tolerance: float = Field(default=1e-3, ge=0.0)
+    initial_noise: float = Field(default=0.01, ge=0.0)
+    schedule: Literal["halving", "paper"] = "halving"
+    backtrack: int | None = Field(default=4, ge=1)
+
+
+class PrioritiesConfiguration(FrozenModel):
+    """How transport priorities are computed, on all particles and once per stage.
+
+    Attributes:
+        kind: ``"potential"``: the dual potentials of the cost |x - y| (the paper); ``"displacement"``: the distance that transport
+            of the cost |x - y|^2 moves each particle, from a solver with an option `exponent`. See
+            `cpdeform.core.priorities.transport_priorities`.
+        blur: Entropic blur of the transport problem, length units. The larger, the quicker and the smoother; up to half a
+            centimetre the potentials' peak stays at the particles that have to move, displacements allow for two.
+    """
+
+    kind: PriorityKind = "potential"
+
+    blur: float = Field(default=5e-3, gt=0.0)
+
+
+class ObjectiveConfiguration(FrozenModel):
+    """What a plan's loss is.
+
+    Attributes:
+        kind: ``"transport"``: transport cost between the last step's particles and the goal (the paper); ``"plasticinelab"``:
+            density, distance and contact terms of node masses, summed over all steps.
+        points: Particles that the transport loss is computed on, a fixed random subset; None for all.
+        blur: Entropic blur of the transport loss, length units.
+        refresh: Solve from scratch every so many evaluations, warm-started between.
+        contact_weight: Weight of PlasticineLab's contact term, which draws tools to the body; where absent 0 for ``"transport"``
+            and 1 for ``"plasticinelab"``.
+        coast_steps: (``"transport"``) Environment steps for which particles are taken to go on as fast as in the last one; see
+            `ObjectiveTransport`.
+        axis_scale: (``"transport"``) Positive factors of the coordinates x, y, z, dimensionless, before distances are taken; see
+            `ObjectiveTransport`.
+        contact: Kind of the contact term of ``"plasticinelab"``; see `cpdeform.planning.objectives.contact.contact_loss`.
+    """
+
+    kind: Literal["transport", "plasticinelab"] = "transport"
+    points: int | None = Field(default=2000, ge=1)
+    blur: float = Field(default=2e-3, gt=0.0)
+    refresh: int = Field(default=50, ge=1)
+    contact_weight: float | None = Field(default=None, ge=0.0)
+    coast_steps: float = Field(default=0.0, ge=0.0)
+    axis_scale: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (1.0, 1.0, 1.0)
+    contact: ContactKind = "plasticinelab"
+
+
+class RefinementConfiguration(FrozenModel):
+    """How a stage's best plan is refined, by another objective than the one that found it.
+
+    Attributes:
+        kind: ``"density"``: the share of misplaced mass, see `cpdeform.planning.objectives.density`; ``"iou"``: PlasticineLab's soft
+            IoU, see `cpdeform.planning.objectives.soft_iou`; ``"transport"``: the transport cost of all particles as it is, without
+            what a task adds to it for the search (factors of the coordinates, coasting).
+        iterations: The most gradient evaluations, and never more than the search's; 0 for no refinement.
+        learning_rate: Adam's step size, in units of action.
+        patience: Stop when nothing improved for this many iterations.
+    """
+
+    kind: Literal["density", "iou", "transport"] = "density"
+    iterations: int = Field(default=0, ge=0)
+    learning_rate: float = Field(default=0.03, gt=0.0)
+    patience: int = Field(default=15, ge=1)
+
+
+class RunConfiguration(FrozenModel):
+    """Everything that defines a run, under the names of the command line and of `--set`.
+
+    Attributes:
+        task: Registered name or path of a YAML file.
+        backend: Registered name of the simulator, or ``"auto"``: the fastest one that is installed.
+        ot: Registered name of the transport solver, or ``"auto"``.
+        placer: Registered name of the placer.
+        device: Where tensors live, ``"cpu"`` or ``"cuda"``.
+        seed: Seed of first actions and random placements.
+        stages: Number of stages; the task's own where absent.
+        steps: Environment steps of a stage; the task's own where absent.
+        rest_steps: Environment steps of rest after them; the task's own where absent.
+        target: File of the goal instead of the task's own, e.g. one written by `cpdeform task import-grid`.
+        algorithm: ``"cpdeform"``, or ``"paper"`` for Algorithm 1 to the letter (`PAPER_SETTINGS`, `PAPER_PLACER_OPTIONS`).
+        optimizer: Options of the optimiser.
+        objective: Options of the loss.
+        priorities: Options of the transport priorities.
+        refinement: Options of the refinement of each stage's plan.
+        scene: Changes of the task's scene, e.g. ``{"ground_friction": 2.0, "bodies": {"0": {"particle_count": 3000}}}``.
+        simulator_options: Further keyword options of the simulator.
+        ot_options: Further keyword options of the transport solver that gives the priorities.
+        placer_options: Keyword options of the placer.
+    """
+
+    task: str = "writer"
+    backend: str = AUTO
+    ot: str = AUTO
+    placer: str = "transport"
+    device: str = "cpu"
+    seed: int = Field(default=0, ge=0)
+    stages: int | None = Field(default=None, ge=1)
+    steps: int | None = Field(default=None, ge=1)
+    rest_steps: int | None = Field(default=None, ge=0)
+    target: Path | None = None
+    algorithm: Literal["cpdeform", "paper"] = "cpdeform"
+    optimizer: OptimizerConfiguration = OptimizerConfiguration()
+    objective: ObjectiveConfiguration = ObjectiveConfiguration()
+    priorities: PrioritiesConfiguration = PrioritiesConfiguration()
+    refinement: RefinementConfiguration = RefinementConfiguration()
+    scene: dict[str, Any] = Field(default_factory=dict)
+    simulator_options: dict[str, Any] = Field(default_factory=dict)
+    ot_options: dict[str, Any] = Field(default_factory=dict)
+    placer_options: dict[str, Any] = Field(default_factory=dict)
+
+    @field_validator("device")
+    @classmethod
+    def _check_device(cls, value: str) -> str:
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", value):
+            raise InputError("device", came=f'"{value}"', expected='"cpu", "cuda" or "cuda:N"')
+        return value
+
+
+def with_task_settings(configuration: RunConfiguration, task: Task) -> RunConfiguration:
+    """Fill in, where the user set nothing, what the algorithm prescribes and then what the task's `settings` say.
+
+    A task's changes of its own scene are limits that a plan keeps to, such as slower tools; ``algorithm=paper`` has the scene as
+    it is, and the default priorities.
+
+    Args:
+        configuration: What the user set; fields that were not set do not count.
+        task: The task to be run.
+
+    Raises:
+        InputError: The task's settings do not fit.
+    """
+    given = configuration.model_dump(exclude_unset=True)
+    base = dict(task.settings)
+    placer = given.get("placer", base.get("placer", configuration.placer))
+    if placer != base.get("placer", "transport"):
+        base.pop("placer_options", None)
+    if configuration.algorithm == "paper":
+        for field in ("scene", "priorities"):
+            base.pop(field, None)
+        base = merge(base, PAPER_SETTINGS)
+        base = merge(base, {"placer_options": PAPER_PLACER_OPTIONS.get(placer, {})})
+    return validate(RunConfiguration, merge(base, given), source=f"task {task.name}: settings")

@@ -1,0 +1,265 @@
+"""The run record: a directory that holds all of a run, readable at any moment, also of a run that was killed.
+
+``run.json``
+    Configuration, task, status, versions, machine; losses and metric once the run is over. A number that is not finite is
+    null. ``status`` is ``"running"`` until the run is over: a killed run keeps it. ``memory``: estimate and measured peak of
+    the rollouts and gradients of the largest batch, bytes. ``resumed_from``: the record that the run went on from, or null; its
+    stages go on counting, so that the first file is that of the stage after the other record's last one.
+``metrics.jsonl``
+    A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage.
+``target.h5``, ``stage-000.h5``, ...
+    The goal, and each finished stage; the attributes of every dataset say what it holds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import torch
+from torch import Tensor
+
+from cpdeform.core.errors import RecordError
+from cpdeform.core.memory import MemoryUse
+from cpdeform.core.task import Task
+from cpdeform.planning.optimizer import Iteration
+from cpdeform.planning.result import DeformResult, Observer, StageResult, Status
+from cpdeform.run.configuration import RunConfiguration
+from cpdeform.run.record_files import (
+    METRICS_FILE,
+    RUN_FILE,
+    TARGET_FILE,
+    check_directory,
+    environment,
+    own_files,
+    replacing,
+    stage_file,
+    to_json,
+    write_dataset,
+    write_json,
+)
+from cpdeform.run.record_reader import RunRecord, load_record
+from cpdeform.run.record_stage import write_stage
+
+__all__ = ["RunRecord", "RunRecorder", "load_record", "save_result"]
+
+FORMAT = 1
+"""Version of the record's layout."""
+
+
+class RunRecorder(Observer):
+    """Writes the record of a run while it goes on.
+
+    Nothing is written before the run starts. As a context manager it also records how the run broke off, if it does:
+    ``"interrupted"`` (by the user) or ``"failed"``.
+
+    Args:
+        directory: Where to write; made if missing.
+        configuration: What defines the run, kept in the record.
+        overwrite: Allow a directory that is not empty; files of an earlier record are then removed, others are left alone.
+        resumed_from: The record that the run goes on from, to be named in this one.
+
+    Raises:
+        InputError: The directory is not empty (without `overwrite`) or cannot be written.
+    """
+
+    def __init__(
+        self,
+        directory: Path | str,
+        *,
+        configuration: RunConfiguration | None = None,
+        overwrite: bool = False,
+        resumed_from: RunRecord | None = None,
+    ) -> None:
+        self.directory = Path(directory)
+        self._configuration = configuration
+        self._resumed_from = resumed_from
+        self._overwrite = overwrite
+        self._run: dict[str, Any] = {}
+        self._batch: dict[int, int] = {}
+        check_directory(self.directory, overwrite=overwrite)
+
+    @property
+    def started(self) -> bool:
+        """Whether there is a record."""
+        return bool(self._run)
+
+    def run_started(self, task: Task, target: Tensor, names: dict[str, str], seed: int) -> None:
+        """Begin the record: everything that is known before the first stage."""
+        check_directory(self.directory, overwrite=self._overwrite)
+        with self._writing():
+            self.directory.mkdir(parents=True, exist_ok=True)
+            for path in own_files(self.directory):
+                path.unlink()
+            self._run = {
+                "format": FORMAT,
+                "status": "running",
+                "advice": "",
+                "names": dict(names),
+                "seed": seed,
+                "stages_finished": 0,
+                "resumed_from": _origin(self._resumed_from),
+                "memory": None,
+                "recorded_at": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+                **environment(),
+                "configuration": self._configuration.model_dump(mode="json") if self._configuration else None,
+                "task": task.model_dump(mode="json"),
+            }
+            with replacing(self.directory / TARGET_FILE) as temporary, h5py.File(temporary, "w") as file:
+                write_dataset(file, "position", target, shape="particle, xyz", units="length (domain edge = 1)")
+                _write_goal_extras(file, task)
+            (self.directory / METRICS_FILE).write_text("", encoding="utf-8")
+            self._write_run()
+
+    def optimization_started(self, stage: int, worlds: int, memory_estimate: int) -> None:
+        """Note the memory that the rollouts are going to need, for a run that is killed for want of it."""
+        self._note_memory(MemoryUse(worlds, memory_estimate, None))
+        with self._writing():
+            self._write_run()
+
+    def _note_memory(self, use: MemoryUse) -> None:
+        noted = self._run["memory"]
+        if noted is None or (use.estimate, use.peak or 0) >= (noted["estimate_bytes"], noted["peak_bytes"] or 0):
+            self._run["memory"] = {"worlds": use.worlds, "estimate_bytes": use.estimate, "peak_bytes": use.peak}
+
+    def iteration_finished(self, stage: int, iteration: Iteration) -> None:
+        """Append an iteration to the metrics."""
+        if iteration.memory is not None:
+            self._note_memory(iteration.memory)
+        # The optimiser counts anew for each batch of candidates; the number of the batch keeps lines apart.
+        self._batch[stage] = self._batch.get(stage, -1) + (1 if iteration.index == 0 else 0)
+        self._append(
+            {
+                "kind": "iteration",
+                "stage": stage,
+                "batch": self._batch[stage],
+                "phase": iteration.phase,
+                "iteration": iteration.index,
+                "loss": iteration.loss,
+                "best_loss": iteration.best_loss,
+                "seconds": iteration.seconds,
+            }
+        )
+
+    def stage_finished(self, result: StageResult) -> None:
+        """Append a stage to the metrics and write its file; the file comes last and marks the stage as finished."""
+        self._append(
+            {
+                "kind": "stage",
+                "stage": result.index,
+                "status": result.status.value,
+                "loss_before": result.loss_before,
+                "loss": result.loss,
+                "best": result.best,
+                "candidates": [candidate.placement.label for candidate in result.candidates],
+                "candidate_loss": [candidate.loss for candidate in result.candidates],
+                "gradient_evaluations": result.gradient_evaluations,
+                "seconds": result.seconds,
+            }
+        )
+        with self._writing():
+            write_stage(self.directory / stage_file(result.index), result)
+            self._run["stages_finished"] += result.status is Status.FINISHED
+            self._write_run()
+
+    def run_finished(self, result: DeformResult) -> None:
+        """Complete the record."""
+        self._finish(
+            status=result.status.value,
+            advice=result.status.advice,
+            loss_initial=result.loss_initial,
+            loss_final=result.loss_final,
+            metric=result.metric_name,
+            metric_initial=result.metric_initial,
+            metric_value=result.metric_value,
+            gradient_evaluations=result.gradient_evaluations,
+            seconds=result.seconds,
+        )
+
+    def __enter__(self) -> RunRecorder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Record that the run broke off, unless it is over or never began."""
+        if error is None or self._run.get("status") != "running":
+            return
+        if isinstance(error, KeyboardInterrupt):
+            advice = "Interrupted; the finished stages are complete."
+            self._finish(status="interrupted", advice=advice)
+        else:
+            # What broke the run is raised anyway; that the record cannot say so must not hide it.
+            with contextlib.suppress(RecordError):
+                self._finish(status="failed", advice=f"{type(error).__name__}: {error}")
+
+    def _finish(self, **fields: Any) -> None:
+        self._run.update(fields)
+        with self._writing():
+            self._write_run()
+
+    def _write_run(self) -> None:
+        write_json(self.directory / RUN_FILE, self._run)
+
+    def _append(self, line: dict[str, Any]) -> None:
+        """Append a line to the metrics; the file is closed at once, so that the line outlives this process."""
+        with self._writing(), (self.directory / METRICS_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(to_json(line), allow_nan=False) + "\n")
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise RecordError(f"cannot write the run record in {self.directory}: {error.strerror or error}.") from error
+
+
+def _write_goal_extras(file: h5py.File, task: Task) -> None:
+    """Keep what else the goal's file says, so that a run which goes on is judged by the same goal."""
+    corresponds = torch.tensor(task.target_corresponds())
+    write_dataset(file, "corresponds", corresponds, shape="", units="whether the particles are the body's, one to one, moved")
+    grid = task.load_target_grid()
+    if grid is not None:
+        cells = torch.nonzero(torch.as_tensor(grid))
+        write_dataset(file, "grid_cells", cells, shape="node, axis", units="index of a grid node")
+        write_dataset(file, "grid_mass", torch.as_tensor(grid)[tuple(cells.T)], shape="node", units="mass")
+
+
+def _origin(record: RunRecord | None) -> dict[str, Any] | None:
+    """What a record says about the one that its run goes on from."""
+    if record is None:
+        return None
+    names = record.run.get("names", {})
+    return {"directory": str(record.directory), "status": record.status, "stages": record.next_stage, "names": names}
+
+
+def save_result(
+    result: DeformResult, directory: Path, *, configuration: RunConfiguration | None = None, overwrite: bool = False
+) -> Path:
+    """Write the record of a run that is over, the same as `RunRecorder` writes during one.
+
+    Args:
+        result: The run.
+        directory: Where to write; made if missing.
+        configuration: What defined the run, kept in the record.
+        overwrite: As for `RunRecorder`.
+
+    Returns:
+        The directory.
+
+    Raises:
+        InputError: The directory is not empty (without `overwrite`) or cannot be written.
+        RecordError: Writing failed on the way, e.g. because the disk is full.
+    """
+    recorder = RunRecorder(directory, configuration=configuration, overwrite=overwrite)
+    recorder.run_started(result.task, result.target, result.names, result.seed)
+    for stage in result.stages:
+        for iteration in stage.history:
+            recorder.iteration_finished(stage.index, iteration)
+        recorder.stage_finished(stage)
+    recorder.run_finished(result)
+    return recorder.directory

@@ -1,0 +1,122 @@
+"""Going on with a run from its record: which state, task and configuration the next run has.
+
+The new run starts from the record's last state. Its task is the record's, scene and goal included, whatever became of the task's
+files meanwhile; its configuration is the record's under the changes asked for. Stages go on counting, and the random numbers of
+a stage depend on seed and number alone, so that a run that is resumed equals one that went through.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from cpdeform.core.errors import InputError
+from cpdeform.core.plugins import AUTO, Registry
+from cpdeform.core.state import State
+from cpdeform.core.task import Task, changed_task, load_task, merge, validate
+from cpdeform.run.configuration import RunConfiguration
+from cpdeform.run.record_files import TARGET_FILE
+from cpdeform.run.record_reader import RunRecord
+
+OPTIONS_OF = {"backend": "simulator_options", "ot": "ot_options", "placer": "placer_options"}
+"""Options that go with a part; they are dropped where another part takes its place."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Resumption:
+    """What a run that goes on begins with.
+
+    Attributes:
+        record: The run's record.
+        task: Its task, with the changes of the scene asked for; its goal is the record's copy.
+        state: Where to start, a single world.
+        first_stage: Number of the first stage.
+    """
+
+    record: RunRecord
+    task: Task
+    state: State
+    first_stage: int
+
+
+def resumed_values(record: RunRecord, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of the configuration of a run that goes on: the record's under the changes.
+
+    Without a change of ``stages`` they are those that the recorded run had left, or one where it had none left.
+
+    Args:
+        record: The record.
+        changes: Fields of `RunConfiguration` to change, nested.
+
+    Raises:
+        InputError: The record's configuration cannot be used.
+    """
+    base = recorded_configuration(record).model_dump(mode="json")
+    for part, options in OPTIONS_OF.items():
+        if part in changes and changes[part] != base[part]:
+            base[options] = {}
+    planned = base["stages"] or record.task.stage_count
+    base["stages"] = max(planned - record.finished_stages, 1)
+    return merge(base, changes)
+
+
+def recorded_configuration(record: RunRecord) -> RunConfiguration:
+    """The configuration in a record, with the parts that ran where it says "auto".
+
+    For a run made in Python, which has none, it is the names of its parts and its seed.
+    """
+    names = {name: value for name, value in record.run.get("names", {}).items() if name in OPTIONS_OF}
+    content = record.run.get("configuration")
+    if content is None:
+        content = {**names, "task": record.task.name, "seed": record.run.get("seed", 0)}
+    elif isinstance(content, dict):
+        content = content | {name: value for name, value in names.items() if content.get(name) == AUTO}
+    return validate(RunConfiguration, content, source=f"run record {record.directory}: configuration")
+
+
+def make_resumption(record: RunRecord, configuration: RunConfiguration) -> Resumption:
+    """Put together what a run that goes on begins with.
+
+    Args:
+        record: The record.
+        configuration: That of the run to come; its scene changes apply to the record's task.
+
+    Raises:
+        InputError: The record has no complete stage, or a change of the scene does not fit.
+    """
+    if not record.stages:
+        raise InputError(
+            f"run record {record.directory}",
+            came="no complete stage",
+            expected="at least one, to go on from",
+            remedy="Run the task from its start, without --resume.",
+        )
+    task = record.task.model_copy(update={"target": record.directory / TARGET_FILE})
+    return Resumption(record, changed_task(task, scene=configuration.scene), record.state, record.next_stage)
+
+
+def check_same_task(record: RunRecord, name: str, *, registry: Registry) -> None:
+    """Raise `InputError` unless a task is the one that a record was made with.
+
+    Args:
+        record: The record.
+        name: Registered name or path of the task that was asked for.
+        registry: Where the name is looked up.
+    """
+    remedy = "Leave TASK out to go on with the record's own; change its scene with --set scene.<field>=<value>."
+    asked = load_task(name, registry=registry)
+    if asked.name != record.task.name:
+        expected = f'"{record.task.name}", the task of run record {record.directory}'
+        raise InputError("TASK", came=f'"{asked.name}"', expected=expected, remedy=remedy)
+    asked = changed_task(asked, scene=recorded_configuration(record).scene)
+    given, recorded = asked.model_dump(), record.task.model_dump()
+    different = [field for field in ("scene", "step_count", "rest_steps", "metric") if given[field] != recorded[field]]
+    goal = torch.as_tensor(asked.load_target()).to(record.target)
+    if goal.shape != record.target.shape or not torch.allclose(goal, record.target, atol=1e-6):
+        different.append("target")
+    if different:
+        came = f'"{asked.name}" with another {", ".join(different)}'
+        raise InputError("TASK", came=came, expected=f"the task as it is in run record {record.directory}", remedy=remedy)
