@@ -91,7 +91,7 @@ def test_the_pen_is_put_over_the_stroke(board: Path) -> None:
     task = load_task(board)
     result = deform(task, optimizer=TrajectoryOptimizer(iterations=1))
     stage = result.stages[0]
-    placed = stage.candidates[0].placement.pose[0, :3]
+    placed = stage.candidates[0].proposal.pose[0, :3]
     assert float((placed - torch.tensor(STROKE[0].start[0]))[[0, 2]].norm()) < 0.08
     # the stroke's far side keeps a priority near zero
     far = (stage.state_before.position[0] - torch.tensor([0.62, 0.08, 0.38])).norm(dim=-1) < 0.1
@@ -114,7 +114,7 @@ def test_solvers_agree_on_the_priorities(board: Path) -> None:
 def test_seeds_repeat_a_run(board: Path) -> None:
     task = load_task(board)
     runs = [deform(task, placer="random", optimizer=TrajectoryOptimizer(iterations=2), seed=seed) for seed in (3, 3, 4)]
-    poses = [run.stages[0].candidates[0].placement.pose for run in runs]
+    poses = [run.stages[0].candidates[0].proposal.pose for run in runs]
     assert torch.equal(poses[0], poses[1])
     assert not torch.equal(poses[0], poses[2])
 

@@ -16,6 +16,7 @@ from cpdeform.cli.evaluate import evaluate
 from cpdeform.cli.experiment import experiment
 from cpdeform.cli.plugins import plugins
 from cpdeform.cli.run import run
+from cpdeform.cli.strategies import strategies
 from cpdeform.cli.task import task
 from cpdeform.cli.tasks import tasks
 from cpdeform.core.errors import CpdeformError
@@ -55,6 +56,7 @@ app = typer.Typer(
 app.command()(run)
 app.command()(evaluate)
 app.command()(tasks)
+app.command()(strategies)
 app.command()(experiment)
 app.command()(plugins)
 app.add_typer(task, name="task")

@@ -13,17 +13,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from cpdeform.core.plugins import Registry
     from cpdeform.planning.result import DeformResult, Observer
-    from cpdeform.run.configuration import RunConfiguration
-    from cpdeform.run.record import RunRecord, RunRecorder
-    from cpdeform.run.resume import Resumption
+    from cpdeform.run.record import RunRecorder
+    from cpdeform.run.resolve import ResolvedRun
 
 FLAGS = {
     "task": "TASK",
     "backend": "--backend",
     "ot": "--ot",
     "placer": "--placer",
+    "strategy": "--strategy",
     "device": "--device",
     "seed": "--seed",
     "stages": "--stages",
@@ -43,6 +42,9 @@ def run(
     ] = None,
     ot: Annotated[str | None, typer.Option(help="Optimal-transport solver.  [default: auto]", metavar="NAME")] = None,
     placer: Annotated[str | None, typer.Option(help="Where tools are put.  [default: transport]", metavar="NAME")] = None,
+    strategy: Annotated[
+        str | None, typer.Option(help="How the search goes, see `cpdeform strategies`.  [default: cpdeform]", metavar="NAME")
+    ] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda.  [default: cpu]", metavar="NAME")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of first actions and random placements.  [default: 0]")] = None,
     stages: Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")] = None,
@@ -50,7 +52,7 @@ def run(
     target: Annotated[
         Path | None, typer.Option(help="Goal file instead of the task's own, see `cpdeform task import-grid`.", metavar="FILE")
     ] = None,
-    iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: 40]")] = None,
+    iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: by the task]")] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Any other option, e.g. optimizer.learning_rate=0.05; repeatable.", metavar="KEY=VALUE"),
@@ -64,6 +66,9 @@ def run(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run record in --out.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line, no progress.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Run nothing; print the configuration with all that was left open, as YAML or JSON.")
+    ] = False,
     no_pictures: Annotated[bool, typer.Option("--no-pictures", help="Draw no picture and no animation.")] = False,
 ) -> None:
     """Plan how the tools of a task turn its body into its goal, and record the run.
@@ -72,38 +77,47 @@ def run(
 
     Exit code 0: a plan was found; 1: none was (the advice says what to try); 2: unusable input; 130: interrupted.
     """
-    flags = (task, backend, ot, placer, device, seed, stages, steps, target, iterations)
+    flags = (task, backend, ot, placer, strategy, device, seed, stages, steps, target, iterations)
     given = {field: value for field, value in zip(FLAGS, flags, strict=True) if value is not None}
-    from cpdeform.core.plugins import load_registry
-    from cpdeform.run.deform import check_names, configured_task, resolved
-
-    configuration, resumption = _configure(given, settings or []), None
-    registry = load_registry()
-    if resume is not None:
-        configuration, resumption = _resume(resume, given, settings or [], registry, out=out)
-    check_names(configuration, registry=registry)
-    task_asked = configured_task(configuration, registry=registry) if resumption is None else None
+    resolved = resolve_command(given, settings or [], resume=resume, out=out)
+    if dry_run:
+        _print_configuration(resolved, as_json=as_json)
+        return
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
-        configuration = resolved(configuration, registry=registry, task=task_asked)
         # Libraries print to stdout, too; a reader of the JSON must not see that.
-        result, directory = _execute(configuration, resumption, registry, out, overwrite=overwrite, silent=as_json)
+        result, directory = _execute(resolved, out, overwrite=overwrite, silent=as_json)
         picture = None if no_pictures else _draw(directory)
     if as_json:
-        typer.echo(json.dumps(_summary(result, configuration, directory, resumed_from=resume)))
+        typer.echo(json.dumps(_summary(result, resolved, directory, resumed_from=resume)))
     else:
         _print_summary(result, directory, picture, resumed_from=resume)
     if not _finished(result):
         raise typer.Exit(1)
 
 
-def _configure(given: dict[str, Any], settings: list[str], record: RunRecord | None = None) -> RunConfiguration:
-    """Build the configuration of ``--set`` and, above it, the flags given; of a record, if any, below them."""
+def resolve_command(
+    given: dict[str, Any], settings: list[str], *, resume: Path | None = None, out: Path | None = None
+) -> ResolvedRun:
+    """The run that a command line asks for.
+
+    Args:
+        given: Values of the flags, by the field of `FLAGS`.
+        settings: Values of ``--set``; flags override them.
+        resume: Record to go on from.
+        out: Directory of the new record.
+
+    Raises:
+        InputError: Something of it cannot be used; the message names the flag.
+    """
     from cpdeform.core.errors import InputError
-    from cpdeform.core.plugins import split_options
+    from cpdeform.core.plugins import load_registry, split_options
     from cpdeform.core.task import merge, validate
     from cpdeform.run.configuration import RunConfiguration
-    from cpdeform.run.resume import resumed_values
+    from cpdeform.run.record_reader import load_record
+    from cpdeform.run.resolve import resolve
 
+    if resume is not None and out is not None and out.resolve() == resume.resolve():
+        raise InputError("--out", came="the directory of --resume", expected="another one, for the record of the stages to come")
     values = split_options(settings)
     for field, value in given.items():
         group, dot, name = field.rpartition(".")
@@ -111,62 +125,46 @@ def _configure(given: dict[str, Any], settings: list[str], record: RunRecord | N
             continue
         values = merge(values, {group: {name: value}} if dot else {field: value})
     try:
-        return validate(RunConfiguration, values if record is None else resumed_values(record, values), source=SOURCE)
+        validate(RunConfiguration, values, source=SOURCE)
     except InputError as error:
         field = error.argument.removeprefix(f"{SOURCE}: ")
         if field in given:
             raise InputError(FLAGS[field], came=error.came, expected=error.expected, remedy=error.remedy) from error
         raise
+    return resolve(values, registry=load_registry(), record=None if resume is None else load_record(resume))
 
 
-def _resume(
-    directory: Path, given: dict[str, Any], settings: list[str], registry: Registry, *, out: Path | None
-) -> tuple[RunConfiguration, Resumption]:
-    """Read the record to go on from; the configuration of the new run is the record's under what is given."""
-    from cpdeform.core.errors import InputError
-    from cpdeform.core.plugins import split_options
-    from cpdeform.run.record import load_record
-    from cpdeform.run.resume import check_same_task, make_resumption
-
-    if out is not None and out.resolve() == directory.resolve():
-        raise InputError("--out", came="the directory of --resume", expected="another one, for the record of the stages to come")
-    record = load_record(directory)
-    task = given.get("task", split_options(settings).get("task"))
-    if task is not None:
-        check_same_task(record, task, registry=registry)
-    configuration = _configure(given, settings, record)
-    return configuration, make_resumption(record, configuration)
-
-
-def _execute(
-    configuration: RunConfiguration,
-    resumption: Resumption | None,
-    registry: Registry,
-    out: Path | None,
-    *,
-    overwrite: bool,
-    silent: bool,
-) -> tuple[DeformResult, Path]:
+def _execute(resolved: ResolvedRun, out: Path | None, *, overwrite: bool, silent: bool) -> tuple[DeformResult, Path]:
     """Run with record and progress; the cheap checks come first, and nothing is written before all are passed."""
-    from cpdeform.run.deform import configured_task, deform_configuration
     from cpdeform.run.record import RunRecorder
 
-    task = configured_task(configuration, registry=registry) if resumption is None else resumption.task
-    task.load_target()
+    configuration = resolved.configuration
+    resolved.task.load_target()
     recorder = RunRecorder(
-        out or _default_directory(task.name),
+        out or _default_directory(resolved.task.name),
         configuration=configuration,
         overwrite=overwrite,
-        resumed_from=None if resumption is None else resumption.record,
+        resumed_from=resolved.record,
     )
-    first_stage = 0 if resumption is None else resumption.first_stage
     try:
-        with recorder, _progress(configuration.stages, first_stage, silent=silent) as observers:
-            result = deform_configuration(configuration, resumption=resumption, observers=[recorder, *observers], registry=registry)
+        with recorder, _progress(configuration.stages, resolved.first_stage, silent=silent) as observers:
+            result = resolved.run([recorder, *observers])
     except KeyboardInterrupt as error:
         typer.echo(_interruption(recorder), err=True)
         raise typer.Exit(130) from error
     return result, recorder.directory
+
+
+def _print_configuration(resolved: ResolvedRun, *, as_json: bool) -> None:
+    """Print all names and values of a run, and its task in full."""
+    import yaml
+
+    content = {
+        "configuration": resolved.configuration.model_dump(mode="json"),
+        "first_stage": resolved.first_stage,
+        "task": resolved.task.model_dump(mode="json"),
+    }
+    typer.echo(json.dumps(content) if as_json else yaml.safe_dump(content, sort_keys=False).rstrip())
 
 
 def _interruption(recorder: RunRecorder) -> str:
@@ -218,17 +216,16 @@ def _finished(result: DeformResult) -> int:
     return sum(stage.actions is not None for stage in result.stages)
 
 
-def _summary(
-    result: DeformResult, configuration: RunConfiguration, directory: Path, *, resumed_from: Path | None
-) -> dict[str, Any]:
+def _summary(result: DeformResult, resolved: ResolvedRun, directory: Path, *, resumed_from: Path | None) -> dict[str, Any]:
     from cpdeform.run.record_files import to_json
 
-    memory = result.memory
+    configuration, memory = resolved.configuration, result.memory
     summary = {
         "task": result.task.name,
         "backend": configuration.backend,
         "ot": configuration.ot,
         "placer": configuration.placer,
+        "strategy": configuration.strategy,
         "seed": result.seed,
         "status": result.status.value,
         "advice": result.status.advice,
@@ -239,6 +236,7 @@ def _summary(
         "metric_value": result.metric_value,
         "stages": _finished(result),
         "gradient_evaluations": result.gradient_evaluations,
+        "rollouts": result.rollouts,
         "seconds": result.seconds,
         "memory_estimate_mb": None if memory is None else memory.estimate / 1e6,
         "peak_memory_mb": None if memory is None or memory.peak is None else memory.peak / 1e6,
@@ -248,6 +246,10 @@ def _summary(
     return {key: to_json(value) for key, value in summary.items()}
 
 
+def _effort(result: DeformResult) -> str:
+    return f"{result.gradient_evaluations} gradient evaluations, {result.rollouts} rollouts without gradient"
+
+
 def _print_summary(result: DeformResult, directory: Path, picture: Path | None, *, resumed_from: Path | None) -> None:
     from cpdeform.cli.progress import megabytes
 
@@ -255,7 +257,7 @@ def _print_summary(result: DeformResult, directory: Path, picture: Path | None, 
         f"{result.task.name}: {result.status.value.replace('_', ' ')}",
         f"  loss     {result.loss_initial:.4g} -> {result.loss_final:.4g}",
         f"  metric   {result.metric_name.replace('_', ' ')} {result.metric_initial:.4g} -> {result.metric_value:.4g}",
-        f"  effort   {_finished(result)} stages, {result.gradient_evaluations} gradient evaluations, {result.seconds:.1f} s",
+        f"  effort   {_finished(result)} stages, {_effort(result)}, {result.seconds:.1f} s",
     ]
     if result.memory is not None and result.memory.peak is not None:
         figures = f"{megabytes(result.memory.peak)} at the peak, {megabytes(result.memory.estimate)} estimated"

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import Any
 
 import pluggy
-
-if TYPE_CHECKING:
-    from cpdeform.planning.result import DeformResult, StageResult
 
 hookspec = pluggy.HookspecMarker("cpdeform")
 hookimpl = pluggy.HookimplMarker("cpdeform")
@@ -56,10 +53,15 @@ def cpdeform_tasks() -> list[PluginSpec]:  # type: ignore[empty-body]
 
 
 @hookspec
-def cpdeform_stage_finished(result: StageResult) -> None:
-    """Observe a finished stage."""
+def cpdeform_strategies() -> list[PluginSpec]:  # type: ignore[empty-body]
+    """Register subclasses of `cpdeform.planning.strategy.Strategy`."""
 
 
 @hookspec
-def cpdeform_run_finished(result: DeformResult) -> None:
-    """Observe a finished run."""
+def cpdeform_stage_finished(result: Any) -> None:
+    """Observe a finished stage, a `cpdeform.planning.result.StageResult`."""
+
+
+@hookspec
+def cpdeform_run_finished(result: Any) -> None:
+    """Observe a finished run, a `cpdeform.planning.result.DeformResult`."""

@@ -20,35 +20,27 @@ class ObjectiveResult:
         loss: Loss (B,) of each world.
         grad_positions: Gradient (B, T+1, N, 3) of the sum of the losses with respect to `Trajectory.positions`.
         grad_manipulators: Gradient (B, T+1, M, 8) with respect to `Trajectory.manipulator_poses`; None for zero.
+        warm: What the objective can start from in the next evaluation of each world, B entries, opaque; None for nothing.
     """
 
     loss: Tensor
     grad_positions: Tensor
     grad_manipulators: Tensor | None = None
+    warm: tuple[object, ...] | None = None
 
 
 class Objective(abc.ABC):
-    """A loss on trajectories; each world is independent of the others."""
+    """A loss on trajectories; each world is independent of the others, and nothing is kept between calls."""
 
     @abc.abstractmethod
-    def evaluate(self, trajectory: Trajectory) -> ObjectiveResult:
-        """Loss and gradient of each world of a trajectory."""
-
-    def begin(self, start: Trajectory) -> ObjectiveResult:
-        """Forget all calls before, and evaluate where a stage begins.
+    def evaluate(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> ObjectiveResult:
+        """Loss and gradient of each world of a trajectory.
 
         Args:
-            start: A single world, evaluated without a warm start. All worlds of the stage begin near its last positions, so that
-                what is found here may serve them all as a warm start.
+            trajectory: B worlds.
+            warm: Entries of `ObjectiveResult.warm` of nearby trajectories, one for each world, to start from; None evaluates from
+                scratch. It may speed up the evaluation, and changes its result within the objective's accuracy only.
         """
-        self.reset()
-        return self.evaluate(start)
-
-    def reset(self) -> None:  # noqa: B027 - most objectives keep nothing
-        """Forget what was kept between calls (warm starts) since `begin`; called before each batch of worlds."""
-
-    def keep(self, worlds: Sequence[int]) -> None:  # noqa: B027 - most objectives keep nothing
-        """From now on a batch holds just these worlds of the previous one, in this order; for warm starts."""
 
 
 class ObjectiveAutograd(Objective):
@@ -58,7 +50,7 @@ class ObjectiveAutograd(Objective):
     def loss(self, positions: Tensor, manipulator_poses: Tensor) -> Tensor:
         """Loss (B,) of positions (B, T+1, N, 3), length units, and tool poses (B, T+1, M, 8)."""
 
-    def evaluate(self, trajectory: Trajectory) -> ObjectiveResult:
+    def evaluate(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> ObjectiveResult:
         """Loss and gradient by automatic differentiation of `loss`."""
         positions = trajectory.positions.detach().requires_grad_()
         poses = trajectory.manipulator_poses.detach().requires_grad_()

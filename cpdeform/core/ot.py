@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import torch
@@ -68,6 +69,20 @@ class OTResult:
     exponent: int = 1
 
 
+@dataclasses.dataclass(frozen=True)
+class TransportProblem:
+    """The transport problem that contact points are read from.
+
+    Attributes:
+        exponent: Power p of the distance in the cost |x - y|^p: 1 for potentials as priorities (the paper), 2 for displacements.
+        blur: Entropic blur, length units. The larger, the quicker and the smoother; up to half a centimetre the potentials' peak
+            stays at the particles that have to move, displacements allow for two.
+    """
+
+    exponent: int = 1
+    blur: float = 5e-3
+
+
 class OTSolver(abc.ABC):
     """Solves optimal transport between two weighted particle clouds."""
 
@@ -98,6 +113,25 @@ class OTSolver(abc.ABC):
         Raises:
             InputError: Shapes, devices or weights do not fit, or a number is not finite.
         """
+
+    def solve_batch(self, sources: Tensor, target: Tensor, *, previous: Sequence[OTResult | None] | None = None) -> list[OTResult]:
+        """Solve one problem a world, all with the same target and uniform weights.
+
+        Args:
+            sources: Source positions (B, N, 3), length units.
+            target: Target positions (M, 3), length units, same device and type.
+            previous: A result of a nearby problem for each world, to start from, or None for a world without.
+
+        Returns:
+            The solution of each world, as `solve` gives it; the default solves one after the other.
+
+        Raises:
+            InputError: As for `solve`, or `previous` has another length than the batch.
+        """
+        starts = [None] * len(sources) if previous is None else list(previous)
+        if len(starts) != len(sources):
+            raise InputError("previous", came=f"{len(starts)} results", expected=f"{len(sources)}, one for each world")
+        return [self.solve(source, target, previous=start) for source, start in zip(sources, starts, strict=True)]
 
 
 def weighted_median(values: Tensor, weights: Tensor) -> Tensor:

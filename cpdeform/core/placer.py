@@ -1,4 +1,4 @@
-"""The placement interface: where to put the tools before optimising their motion."""
+"""The placement interface: where to put the tools, and how they begin to move, before their motion is optimised."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from cpdeform.core.errors import InputError
+from cpdeform.core.ot import OTResult, TransportProblem
+from cpdeform.core.priorities import transport_displacements, transport_priorities
 from cpdeform.core.scene import Scene
 from cpdeform.core.state import State
 
@@ -25,54 +28,77 @@ class Stage:
         scene: The scene.
         state: The current state S_i, a single world.
         target: Goal particles G (M, 3), length units.
-        priorities: Transport priorities f (N,), cost or length units (see `transport_priorities`); nan where the
-            placer declared that it needs none.
+        transport: Solution of the placer's `Placer.transport_problem` from the N particles to the goal; None for a placer
+            without one.
         generator: Source of randomness on the CPU, seeded by the run.
         loss: Loss of leaving the state as it is, objective units; nan where it is unknown.
         failed_contacts: Contact particles of the candidates of all stages since the last one that gained at least `LEAST_GAIN`.
-        displacements: Where transport moves each particle (N, 3), length units; None where the priorities are potentials.
     """
 
     index: int
     scene: Scene
     state: State
     target: Tensor
-    priorities: Tensor
+    transport: OTResult | None
     generator: torch.Generator
     loss: float = float("nan")
     failed_contacts: tuple[int, ...] = ()
-    displacements: Tensor | None = None
+
+    @property
+    def priorities(self) -> Tensor:
+        """Transport priorities f (N,), cost or length units, see `transport_priorities`; nan without a transport problem."""
+        if self.transport is None:
+            return torch.full_like(self.state.position[0, :, 0], torch.nan)
+        return transport_priorities(self.transport)
+
+    @property
+    def displacements(self) -> Tensor:
+        """Where transport moves each particle (N, 3), length units.
+
+        Raises:
+            InputError: There is no transport problem, or it is not one of the squared distance.
+        """
+        if self.transport is None:
+            raise InputError(
+                "stage.transport",
+                came="None",
+                expected="a solved transport problem",
+                remedy="Declare it: the placer's transport_problem.",
+            )
+        return transport_displacements(self.transport)
 
 
 @dataclasses.dataclass(frozen=True)
-class Placement:
-    """Poses of all tools for one candidate plan, i.e. for one world.
+class Proposal:
+    """A candidate plan to begin with: poses of all tools, and how they begin to move. It becomes one world.
 
     Attributes:
         pose: Tool poses (M, 8); see `State.manipulator_pose`.
         score: The placement score (paper, section "Direct Single Manipulator Placement"), cost units; nan where not computed.
         label: Short name of the candidate, e.g. ``"direct"`` or ``"left-right"``.
         contact_particle: Index of the particle the tools were placed around; None where there is none.
+        actions: First actions (T, A) in [-1, 1] of the steps in which the tools act; None leaves them to the optimiser.
     """
 
     pose: Tensor
     score: float
     label: str
     contact_particle: int | None = None
+    actions: Tensor | None = None
 
 
 @dataclasses.dataclass(frozen=True)
-class PlacementResult:
-    """What became of a placement.
+class Candidate:
+    """A proposal and what became of it.
 
     Attributes:
-        placement: The placement that was asked for.
-        loss: Best loss of its plan, objective units.
-        actions: The plan (T, A) with that loss, in [-1, 1].
+        proposal: What was proposed.
+        loss: Best loss of its plan, objective units; nan before it was tried.
+        actions: The plan (T, A) with that loss, in [-1, 1], rest included.
         finite: Whether every loss and gradient on the way was finite; otherwise the search ended early.
     """
 
-    placement: Placement
+    proposal: Proposal
     loss: float
     actions: Tensor
     finite: bool = True
@@ -96,22 +122,28 @@ class Placer(abc.ABC):
 
     capabilities: ClassVar[PlacerCapabilities]
 
+    @property
+    def transport_problem(self) -> TransportProblem | None:
+        """The transport problem whose solution `Stage.transport` holds; None where the placer needs no priorities."""
+        return TransportProblem() if self.capabilities.needs_priorities else None
+
     @abc.abstractmethod
-    def ask(self, stage: Stage) -> list[Placement]:
-        """Propose candidates, solved as one batch of worlds.
+    def ask(self, stage: Stage) -> list[Proposal]:
+        """Propose candidates; they share the budget of a round.
 
         Args:
             stage: Current state, goal and priorities.
 
         Returns:
-            Candidates free of collision with the body; empty where there is none.
+            Proposals free of collision with the body; empty where there is none.
         """
 
-    def tell(self, results: list[PlacementResult]) -> bool:
-        """Receive the plans found from the placements asked for last.
+    def tell(self, results: list[Candidate]) -> bool:
+        """Receive the plans found from the proposals asked for last.
 
         Args:
-            results: One entry per placement, in the order asked for.
+            results: One entry per proposal, in the order asked for. The loss of one that a phase of the search has left out is
+                infinite.
 
         Returns:
             Whether to ask again in the same stage; False unless a placer searches in rounds.

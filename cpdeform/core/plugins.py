@@ -23,6 +23,7 @@ KINDS: Mapping[str, str] = {
     "simulator": "cpdeform_simulators",
     "ot_solver": "cpdeform_ot_solvers",
     "placer": "cpdeform_placers",
+    "strategy": "cpdeform_strategies",
     "task": "cpdeform_tasks",
 }
 """What can be registered, and the hook that registers it."""

@@ -20,6 +20,7 @@ from cpdeform.core.target import load_correspondence, load_target, load_target_g
 __all__ = [
     "Task",
     "changed_task",
+    "limited_task",
     "list_variants",
     "load_target",
     "load_task",
@@ -45,8 +46,8 @@ class Task(FrozenModel):
             was pushed slides on, and a shape that is right only in passing is no result.
         stage_count: Number of stages that the task is meant for.
         metric: What the result is judged by.
-        settings: What a run of this task sets where the user does not: fields of `cpdeform.run.configuration.RunConfiguration`.
-            Its `scene` holds limits that plans keep to, such as slower tools; `scene` above stays the benchmark's.
+        limits: Physical limits that plans keep to, such as slower tools: changes of the scene, nested as `merge` takes them. The
+            scene itself stays the benchmark's; see `limited_task`.
     """
 
     name: str
@@ -57,7 +58,7 @@ class Task(FrozenModel):
     rest_steps: int = Field(default=0, ge=0)
     stage_count: int = Field(default=1, ge=1)
     metric: Literal["incremental_iou", "wasserstein"] = "wasserstein"
-    settings: dict[str, Any] = Field(default_factory=dict)
+    limits: dict[str, Any] = Field(default_factory=dict)
 
     @property
     def rollout_steps(self) -> int:
@@ -227,6 +228,18 @@ def read_task(path: Path, *, variant: str | None = None) -> Task:
     if isinstance(content.get("target"), str):
         content["target"] = path.parent / content["target"]
     return validate(Task, content, source=f"task file {path}")
+
+
+def limited_task(task: Task) -> Task:
+    """The task with its limits on the scene in force; `limits` is empty then.
+
+    Raises:
+        InputError: A limit does not fit the scene.
+    """
+    if not task.limits:
+        return task
+    content = task.model_dump(exclude={"limits"})
+    return validate(Task, merge(content, {"scene": task.limits}), source=f"task {task.name}: limits")
 
 
 def changed_task(

@@ -129,15 +129,15 @@ def run(request: dict[str, Any]) -> dict[str, Any]:
         The fields of `MEASURED`: losses in objective units, wall time of the run and of its parts, the parts of an iteration as
         means over all iterations, peak memory in megabytes (1e6 bytes) above what the process held before.
     """
-    from cpdeform.run.deform import deform_configuration
     from cpdeform.run.record_files import to_json
+    from cpdeform.run.resolve import resolve
 
     configuration = RunConfiguration.model_validate(request)
     registry = load_registry()
     for kind, name in (("simulator", configuration.backend), ("ot_solver", configuration.ot)):
         registry.load(kind, name)
     gauge = MemoryGauge(configuration.device)
-    result = deform_configuration(configuration, registry=registry)
+    result = resolve(configuration, registry=registry).run()
     history = [iteration for stage in result.stages for iteration in stage.history]
     stage_seconds = {part: sum(stage.seconds.get(part, 0.0) for stage in result.stages) for part in STAGE_PARTS}
     iteration_seconds = {part: sum(item.seconds.get(part, 0.0) for item in history) for part in ITERATION_PARTS}

@@ -30,9 +30,9 @@ from cpdeform.experiments.experiment_plan import (
 from cpdeform.experiments.experiment_row import OVER, ExperimentRow, forget, forget_failure, note_failure, read_row
 from cpdeform.planning.result import Observer
 from cpdeform.run.configuration import RunConfiguration
-from cpdeform.run.deform import deform_configuration
 from cpdeform.run.record import RunRecorder
 from cpdeform.run.record_reader import RunRecord, load_record
+from cpdeform.run.resolve import ResolvedRun
 from cpdeform.run.resume import recorded_configuration
 
 Observe = Callable[[PlannedRun], AbstractContextManager[Sequence[Observer]]]
@@ -85,24 +85,24 @@ def _row(
     run: PlannedRun, settings: ExperimentSettings, registry: Registry, iterations: int | None, *, resume: bool, observe: Observe
 ) -> ExperimentRow:
     try:
-        configuration, task = configure(run, settings, registry=registry, iterations=iterations)
-        reused = resume and is_done(run.directory, configuration, task)
+        resolved = configure(run, settings, registry=registry, iterations=iterations)
+        reused = resume and is_done(run.directory, resolved.configuration, resolved.task)
         if reused:
             forget_failure(run)
         else:
-            _make(run, configuration, registry, observe)
+            _make(run, resolved, observe)
     except Exception as error:
         return note_failure(run, error)
     return read_row(run, paper_metric=settings.paper_metric, reused=reused)
 
 
-def _make(run: PlannedRun, configuration: RunConfiguration, registry: Registry, observe: Observe) -> None:
+def _make(run: PlannedRun, resolved: ResolvedRun, observe: Observe) -> None:
     """Run with a record, in place of what is there; a run that breaks off once it has begun says so in its record."""
-    recorder = RunRecorder(run.directory, configuration=configuration, overwrite=True)
+    recorder = RunRecorder(run.directory, configuration=resolved.configuration, overwrite=True)
     forget(run)
     try:
         with recorder, observe(run) as observers:
-            deform_configuration(configuration, observers=[recorder, *observers], registry=registry)
+            resolved.run([recorder, *observers])
     except RecordError:
         raise
     except Exception:

@@ -12,8 +12,8 @@ from typing import Any
 from cpdeform.core.errors import InputError, UnknownNameError
 from cpdeform.core.plugins import Registry
 from cpdeform.core.task import Task, changed_task, load_task, merge, validate
-from cpdeform.run.configuration import RunConfiguration, with_task_settings
-from cpdeform.run.deform import configured_task, resolved
+from cpdeform.run.configuration import RunConfiguration
+from cpdeform.run.resolve import ResolvedRun, resolve
 
 MULTI_STAGE, SINGLE_STAGE = "multi-stage", "single-stage"
 
@@ -31,18 +31,20 @@ VARIANTS = ("v1", "v2", "v3")
 METHODS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "cpdeform": {"placer": "transport"},
-        "paper": {"placer": "transport", "algorithm": "paper"},
+        "tuned": {"placer": "transport", "strategy": "tuned"},
+        "paper": {"placer": "transport", "strategy": "paper"},
         "fixed": {"placer": "fixed"},
         "random": {"placer": "random"},
     }
 )
-"""What each method sets: this project's method, Algorithm 1 to the letter, PlasticineLab's protocol, the paper's ablation."""
+"""What each method sets: this project's method, the same with settings tuned for each of the paper's tasks, Algorithm 1 to the
+letter, PlasticineLab's protocol, the paper's ablation."""
 
 REFERENCE, BASELINE = "cpdeform", "fixed"
 """With equal evaluations the second gets as many as the first one used."""
 
 OWN_OPTIONS: Mapping[str, str] = MappingProxyType(
-    {"task": "--tasks", "seed": "--seeds", "placer": "--methods", "algorithm": "--methods", "target": "--targets"}
+    {"task": "--tasks", "seed": "--seeds", "placer": "--methods", "strategy": "--methods", "target": "--targets"}
 )
 """Fields of the configuration that the experiment sets itself, and the option to use instead."""
 
@@ -178,16 +180,14 @@ def record_directory(out: Path, task: str, method: str, seed: int) -> Path:
     return out / re.sub(r"[^\w.+-]", "_", task) / f"{method}-seed{seed}"
 
 
-def configure(
-    run: PlannedRun, settings: ExperimentSettings, *, registry: Registry, iterations: int | None = None
-) -> tuple[RunConfiguration, Task]:
-    """The configuration of a run, with all names and settings in place, and its task.
+def configure(run: PlannedRun, settings: ExperimentSettings, *, registry: Registry, iterations: int | None = None) -> ResolvedRun:
+    """A run, ready to start.
 
     Args:
         run: The run.
         settings: Those of the experiment.
         registry: Where names are looked up.
-        iterations: Gradient evaluations of each stage, all of which are made; those of `settings` where absent.
+        iterations: Gradient evaluations of each stage, all of which are made; defaults to those of `settings`.
 
     Raises:
         InputError: The task, its goal or an option cannot be used.
@@ -199,9 +199,7 @@ def configure(
         values["scene"] = _with_particles(load_task(run.source, registry=registry), values.get("scene", {}), settings.particles)
     if settings.targets is not None:
         values["target"] = _goal(settings.targets, run.task)
-    configuration = validate(RunConfiguration, values, source="experiment")
-    task = configured_task(configuration, registry=registry)
-    return resolved(with_task_settings(configuration, task), registry=registry), task
+    return resolve(validate(RunConfiguration, values, source="experiment"), registry=registry)
 
 
 def _values(settings: ExperimentSettings, source: str, method: Mapping[str, Any], seed: int) -> dict[str, Any]:

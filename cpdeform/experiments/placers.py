@@ -11,11 +11,9 @@ from typing import Annotated, Any
 import typer
 
 from cpdeform.core.plugins import Registry, load_registry
-from cpdeform.core.task import validate
 from cpdeform.experiments.tables import markdown
 from cpdeform.planning.result import DeformResult
-from cpdeform.run.configuration import RunConfiguration
-from cpdeform.run.deform import deform_configuration
+from cpdeform.run.resolve import resolve
 
 COLUMNS = ("task", "placer", "seed", "status", "loss initial", "loss final", "ratio", "metric", "evaluations", "seconds")
 
@@ -24,7 +22,7 @@ def run_placer(task: str, placer: str, seed: int, *, iterations: int, registry: 
     """Run one task with one placer and one seed."""
     options: dict[str, Any] = {"iterations": iterations, "patience": iterations}
     values = {"task": task, "placer": placer, "seed": seed, "optimizer": options}
-    return deform_configuration(validate(RunConfiguration, values, source="experiment"), registry=registry)
+    return resolve(values, registry=registry).run()
 
 
 def table_row(placer: str, seed: int, result: DeformResult) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cpdeform.core.placer import Placement, Placer, PlacerCapabilities, Stage
+from cpdeform.core.placer import Placer, PlacerCapabilities, Proposal, Stage
 
 
 class PlacerFixed(Placer):
@@ -10,6 +10,6 @@ class PlacerFixed(Placer):
 
     capabilities = PlacerCapabilities(needs_priorities=False, max_manipulators=None)
 
-    def ask(self, stage: Stage) -> list[Placement]:
+    def ask(self, stage: Stage) -> list[Proposal]:
         """Propose the current poses as the only candidate."""
-        return [Placement(pose=stage.state.manipulator_pose[0].clone(), score=float("nan"), label="fixed")]
+        return [Proposal(pose=stage.state.manipulator_pose[0].clone(), score=float("nan"), label="fixed")]

@@ -1,4 +1,4 @@
-"""Candidate poses: how a tool, or a pair of tools, takes hold of a body.
+"""How tools are turned to take hold of a body, and the axes along which pairs of them face each other.
 
 References:
     Li et al., "Contact Points Discovery for Soft-Body Manipulations with Differentiable Physics", ICLR 2022, section "Multiple
@@ -7,13 +7,12 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
 
 import torch
 from torch import Tensor
 
-from cpdeform.core.errors import InputError
 from cpdeform.core.rotation import multiply, rotate
 from cpdeform.core.scene import Manipulator, ManipulatorBox, Vector3
 
@@ -21,30 +20,6 @@ GRASP_DIRECTIONS: Mapping[str, Vector3] = MappingProxyType(
     {"left-right": (1.0, 0.0, 0.0), "top-bottom": (0.0, 1.0, 0.0), "front-back": (0.0, 0.0, 1.0)}
 )
 """Axis along which the tools of a grasp face each other."""
-
-DIRECT, APART, CURRENT, PUSH = "direct", "apart", "current", "push"
-"""Candidates without an axis: the score alone places one tool; each tool at a contact point of its own; tools stay; each tool
-behind clay of its own, see `cpdeform.placement.push`."""
-
-POSE_NAMES = (*GRASP_DIRECTIONS, DIRECT, APART, CURRENT, PUSH)
-
-
-def check_poses(poses: Sequence[str] | None) -> tuple[str, ...] | None:
-    """The names as a tuple; None stays None.
-
-    Raises:
-        InputError: A name is unknown or given twice, or there is none.
-    """
-    if poses is None:
-        return None
-    names = (poses,) if isinstance(poses, str) else tuple(poses)
-    for name in names:
-        if name not in POSE_NAMES or names.count(name) > 1:
-            expected = f"distinct names out of {', '.join(POSE_NAMES)}"
-            raise InputError("poses", came=", ".join(map(str, names)), expected=expected)
-    if not names:
-        raise InputError("poses", came="no pose", expected=f"at least one of {', '.join(POSE_NAMES)}")
-    return names
 
 
 def turned(manipulator: Manipulator, direction: Tensor) -> Tensor:

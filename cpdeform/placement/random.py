@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.placer import Placement, PlacementResult, Placer, PlacerCapabilities, Stage
+from cpdeform.core.placer import Candidate, Placer, PlacerCapabilities, Proposal, Stage
 from cpdeform.core.scene import Manipulator, Vector3
 from cpdeform.placement.grasp import TOOLS_PER_GRASP, GraspSearch
 from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulators
@@ -31,7 +31,7 @@ class PlacerRandom(Placer):
 
     Args:
         candidates: Number of placements.
-        attempts: Particles drawn for one placement before it is given up.
+        draws: Particles drawn for one placement before it is given up.
         rounds: The most rounds of candidates in a stage.
         grid_size: Positions along each axis of every grid.
         refinements: Number of finer grids.
@@ -52,7 +52,7 @@ class PlacerRandom(Placer):
         self,
         *,
         candidates: int = 1,
-        attempts: int = 20,
+        draws: int = 20,
         rounds: int = 3,
         grid_size: int = 20,
         refinements: int = 2,
@@ -60,17 +60,17 @@ class PlacerRandom(Placer):
         margin: float | None = None,
         max_gap: float | None = 0.0005,
     ) -> None:
-        for name, number in (("candidates", candidates), ("attempts", attempts), ("rounds", rounds)):
+        for name, number in (("candidates", candidates), ("draws", draws), ("rounds", rounds)):
             if number < 1:
                 raise InputError(name, came=str(number), expected="at least 1")
-        self.candidates, self.attempts, self.rounds = candidates, attempts, rounds
+        self.candidates, self.draws, self.rounds = candidates, draws, rounds
         self._stage: Stage | None = None
         self._round = 0
         self.options = GridOptions(
             grid_size=grid_size, refinements=refinements, clearance=clearance, margin=margin, max_gap=max_gap
         )
 
-    def ask(self, stage: Stage) -> list[Placement]:
+    def ask(self, stage: Stage) -> list[Proposal]:
         """Propose `candidates` placements, fewer where no drawn particle can be touched.
 
         Raises:
@@ -92,14 +92,14 @@ class PlacerRandom(Placer):
                 placements.append(placement)
         return placements
 
-    def tell(self, results: list[PlacementResult]) -> bool:
+    def tell(self, results: list[Candidate]) -> bool:
         """Ask again as long as nothing lowered the loss and rounds are left."""
         stage = self._stage
         if stage is None:
             return False
         return all(not result.loss < stage.loss for result in results) and self._round < self.rounds
 
-    def _draw_grasps(self, stage: Stage, movable: Sequence[int], surface: Tensor, label: str) -> Placement | None:
+    def _draw_grasps(self, stage: Stage, movable: Sequence[int], surface: Tensor, label: str) -> Proposal | None:
         particles = stage.state.position[0].detach()
         search = GraspSearch(manipulators=stage.scene.manipulators, particles=particles, clearance=self.options.clearance)
         poses, first = stage.state.manipulator_pose[0].detach().clone(), None
@@ -107,7 +107,7 @@ class PlacerRandom(Placer):
         for start in range(0, len(movable), TOOLS_PER_GRASP):
             tools = movable[start : start + TOOLS_PER_GRASP]
             grasp = None
-            for _ in range(self.attempts):
+            for _ in range(self.draws):
                 particle = _draw_one(surface, stage.generator)
                 direction = torch.tensor(_draw_direction(stage.generator)).to(particles)
                 point = particles[particle]
@@ -121,10 +121,10 @@ class PlacerRandom(Placer):
             if grasp is None:
                 return None
             poses, placed, first = grasp.poses, [*placed, *tools], particle if first is None else first
-        return Placement(pose=poses, score=float("nan"), label=label, contact_particle=first)
+        return Proposal(pose=poses, score=float("nan"), label=label, contact_particle=first)
 
-    def _draw(self, grid: ToolGrid, surface: Tensor, generator: torch.Generator, label: str) -> Placement | None:
-        for _ in range(self.attempts):
+    def _draw(self, grid: ToolGrid, surface: Tensor, generator: torch.Generator, label: str) -> Proposal | None:
+        for _ in range(self.draws):
             particle = _draw_one(surface, generator)
             point = grid.particles[particle]
 
@@ -134,7 +134,7 @@ class PlacerRandom(Placer):
             found = grid.search(point, gap)
             if found is not None:
                 pose = grid.pose_at(found.position)
-                return Placement(pose=pose, score=float("nan"), label=label, contact_particle=particle)
+                return Proposal(pose=pose, score=float("nan"), label=label, contact_particle=particle)
         return None
 
 

@@ -11,29 +11,46 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cpdeform.core.errors import CapabilityError, InputError
+from cpdeform.core.errors import InputError
 from cpdeform.core.objective import Objective
-from cpdeform.core.ot import OTSolver
-from cpdeform.core.placer import LEAST_GAIN, Placement, PlacementResult, Placer, Stage
-from cpdeform.core.priorities import PriorityKind, transport_displacements, transport_priorities
-from cpdeform.core.scene import Scene
-from cpdeform.core.signed_distance import signed_distance
+from cpdeform.core.ot import OTSolver, TransportProblem
+from cpdeform.core.placer import LEAST_GAIN, Candidate, Placer, Stage
 from cpdeform.core.simulator import Simulator, Trajectory
 from cpdeform.core.state import State
 from cpdeform.core.task import Task
+from cpdeform.planning.checks import check_parts, check_run, check_start, check_tools_outside
+from cpdeform.planning.executor import Executor, ExecutorSerial
 from cpdeform.planning.metrics import evaluate_metric
-from cpdeform.planning.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
-from cpdeform.planning.refinement import Refinement, gained
+from cpdeform.planning.optimizer import Iteration
+from cpdeform.planning.phases.phase import Phase
 from cpdeform.planning.result import DeformResult, Observer, StageResult, Status
+from cpdeform.planning.still import still_trajectory
+from cpdeform.planning.workbench import Workbench
 
-MAX_START_DEPTH = 1e-3
-"""How deep a particle may lie inside a tool at the scene's start, length units."""
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Start:
+    """Where the stages of a run begin.
+
+    Attributes:
+        state: The state, a single world.
+        target: Goal particles G (M, 3), length units.
+        first_stage: Number of the first stage.
+        stages: Number of stages.
+        previous: The stages before the first one, of a run that goes on.
+    """
+
+    state: State
+    target: Tensor
+    first_stage: int
+    stages: int
+    previous: tuple[StageResult, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,12 +60,13 @@ class Planner:
     Attributes:
         task: Scene, goal and schedule.
         simulator: Differentiable physics.
-        ot_solver: Gives the transport priorities.
-        placer: Turns priorities into candidate placements.
-        objective: The shape loss.
-        optimizer: Finds actions.
-        priority_kind: What the priorities are; see `transport_priorities`.
-        refinement: Goes on from each stage's best plan before it is executed; not part of Algorithm 1.
+        ot_solver: Solves the placer's transport problem.
+        placer: Turns transport priorities into proposals.
+        problem: The transport problem that `ot_solver` solves for the placer; defaults to the one that the placer declares.
+        objective: The shape loss, by which plans are chosen.
+        phases: The steps from proposals to a stage's plan; see `cpdeform.planning.phases.phase.Phase`.
+        loop: Leads from stage to stage; defaults to Algorithm 1's, `contact_points_discovery`.
+        executor: Where batches of worlds are computed.
         seed: Seed of first actions and random placements.
         observers: Told of every iteration and stage.
         names: Names of the parts for the record.
@@ -59,9 +77,10 @@ class Planner:
     ot_solver: OTSolver
     placer: Placer
     objective: Objective
-    optimizer: TrajectoryOptimizer
-    priority_kind: PriorityKind = "potential"
-    refinement: Refinement | None = None
+    phases: Sequence[Phase]
+    problem: TransportProblem | None = None
+    loop: Callable[[Planner, Start], Iterator[StageResult]] | None = None
+    executor: Executor = dataclasses.field(default_factory=ExecutorSerial)
     seed: int = 0
     observers: tuple[Observer, ...] = ()
     names: dict[str, str] = dataclasses.field(default_factory=dict)
@@ -77,8 +96,8 @@ class Planner:
         """Run Algorithm 1.
 
         Args:
-            stages: Number of stages; the task's own where absent.
-            state: Where to start, a single world, e.g. the last state of a run record; the scene's start where absent.
+            stages: Number of stages; defaults to the task's own.
+            state: Where to start, a single world, e.g. the last state of a run record; defaults to the scene's start.
             first_stage: Number of the first stage: of one that goes on from a record, `RunRecord.next_stage`. With the seed it
                 determines the random numbers, so that a run that is resumed equals one that went through.
             previous: The stages before the first one, of a run that goes on: contact points that failed there are not tried again.
@@ -92,30 +111,26 @@ class Planner:
                 body.
         """
         count = self.task.stage_count if stages is None else stages
-        if count < 1:
-            raise InputError("stages", came=str(count), expected="at least 1")
-        if first_stage < 0:
-            raise InputError("first_stage", came=str(first_stage), expected="0 or more")
-        self._check()
+        check_run(count, first_stage)
+        check_parts(self.task, self.simulator, self.placer, self.ot_solver, problem=self.problem or self.placer.transport_problem)
+        if not self._phases("round"):
+            raise InputError(
+                "phases", came="none that works on a round of candidates", expected="at least one, such as PhaseDescent"
+            )
         scene_start = self.simulator.initial_state(batch_size=1)
         check_tools_outside(self.task.scene, scene_start)
-        state = scene_start if state is None else self._check_state(state)
-        start = time.perf_counter()
+        state = scene_start if state is None else check_start(self.task, self.simulator, state)
+        begun = time.perf_counter()
         target = torch.as_tensor(self.task.load_target()).to(device=self.simulator.device, dtype=self.simulator.dtype)
         for observer in self.observers:
             observer.run_started(self.task, target, self.names, self.seed)
-        results: list[StageResult] = []
-        # "for each stage:"
-        for index in range(first_stage, first_stage + count):
-            failed = failed_contacts([*previous, *results])
-            result = self._stage(index, state, target, stage_generator(self.seed, index), failed)
+        start = Start(state=state, target=target, first_stage=first_stage, stages=count, previous=tuple(previous))
+        results = []
+        for result in (self.loop or contact_points_discovery)(self, start):
             results.append(result)
             for observer in self.observers:
                 observer.stage_finished(result)
-            if result.status is not Status.FINISHED:
-                break
-            state = result.state
-        metric = evaluate_metric(self.task, start=scene_start.position[0], final=state.position[0], target=target)
+        metric = evaluate_metric(self.task, start=scene_start.position[0], final=results[-1].state.position[0], target=target)
         finished = DeformResult(
             task=self.task,
             target=target,
@@ -127,7 +142,8 @@ class Planner:
             metric_initial=metric.initial,
             metric_value=metric.final,
             gradient_evaluations=sum(result.gradient_evaluations for result in results),
-            seconds=time.perf_counter() - start,
+            rollouts=sum(result.rollouts for result in results),
+            seconds=time.perf_counter() - begun,
             names=self.names,
             seed=self.seed,
         )
@@ -135,157 +151,158 @@ class Planner:
             observer.run_finished(finished)
         return finished
 
-    def _check(self) -> None:
-        """Hold the parts against each other's declared capabilities before any work is done."""
-        if not self.simulator.capabilities.differentiable:
-            raise CapabilityError(f"{type(self.simulator).__name__} has no gradient; choose a differentiable simulator.")
-        placing, transport = self.placer.capabilities, self.ot_solver.capabilities
-        if placing.needs_priorities and self.priority_kind == "potential" and transport.potentials != "entropic":
-            raise CapabilityError(
-                f"{type(self.ot_solver).__name__} gives exact dual potentials, which are no transport priorities: where the shapes "
-                "agree they are arbitrary. Choose a solver with entropic potentials, such as pot or geomloss."
-            )
-        movable = sum(manipulator.movable for manipulator in self.task.scene.manipulators)
-        if movable == 0:
-            raise InputError("scene.manipulators", came="no movable tool", expected="at least one with a positive action_scale")
-        if placing.max_manipulators is not None and movable > placing.max_manipulators:
-            raise CapabilityError(
-                f"{type(self.placer).__name__} places at most {placing.max_manipulators} movable tools, the scene has {movable}; "
-                "use the placer fixed."
-            )
-        if self.simulator.scene != self.task.scene:
-            raise InputError("simulator", came="a simulator of another scene", expected="one built from task.scene")
+    def stage(
+        self,
+        start: Start,
+        index: int,
+        state: State,
+        before: Sequence[StageResult],
+        *,
+        warm: tuple[object, ...] | None = None,
+    ) -> StageResult:
+        """Plan and execute one stage.
 
-    def _check_state(self, state: State) -> State:
-        """Move a given start to the simulator's device and type."""
-        state = state.to(device=self.simulator.device, dtype=self.simulator.dtype)
-        if state.batch_size != 1:
-            raise InputError("state", came=f"{state.batch_size} worlds", expected="a single world")
-        actions = torch.zeros(1, self.task.rollout_steps, self.task.scene.action_size)
-        self.simulator.check_inputs(state, actions)
-        return state
-
-    def _stage(self, index: int, state: State, target: Tensor, generator: torch.Generator, failed: tuple[int, ...]) -> StageResult:
-        """One stage: priorities, placements, plans, execution of the best."""
-        seconds: dict[str, float] = {}
-        clock = _Clock(seconds)
-        still = still_trajectory(state, self.task.rollout_steps, scene=self.task.scene)
-        loss_before = float(self.objective.begin(still).loss[0])
-        # "priorities f = optimal-transport potentials between current shape S_i and goal G"
-        priorities, displacements = torch.full_like(state.position[0, :, 0], torch.nan), None
-        if self.placer.capabilities.needs_priorities:
-            transport = self.ot_solver.solve(state.position[0], target)
-            priorities = transport_priorities(transport, kind=self.priority_kind)
-            displacements = transport_displacements(transport) if self.priority_kind == "displacement" else None
-        clock.lap("transport")
-        stage = Stage(index, self.task.scene, state, target, priorities, generator, loss_before, failed, displacements)
-        candidates: list[PlacementResult] = []
-        history: list[Iteration] = []
-        evaluations = 0
-        while True:
-            # "p = particle with the largest priority; place the tools around p: best score, no collision with the body"
-            placements = self.placer.ask(stage)
-            clock.lap("placement")
-            if not placements:
-                break
-            # "for each candidate pose in T: actions, loss = minimise the shape loss through the simulator"
-            found = self._optimize(index, state, placements, generator)
-            evaluations += sum(plans.gradient_evaluations for plans in found)
-            history.extend(iteration for plans in found for iteration in plans.history)
-            results = _pair(placements, found)
-            candidates.extend(results)
-            clock.lap("optimization")
-            if not self.placer.tell(results):
-                break
+        Args:
+            start: Goal and stages of the run.
+            index: Number of the stage.
+            state: State S_i, a single world.
+            before: All stages that led here, the oldest first.
+            warm: What the objective can start from, of the stage before (`StageResult.warm`).
+        """
+        bench = self._workbench(start, index, state, before, warm)
+        candidates = self._search(bench)
         # "execute the plan with the lowest loss"
-        best = min(range(len(candidates)), key=lambda i: candidates[i].loss, default=None)
-        status = _stage_status(candidates, best, loss_before)
-        trajectory, loss = None, loss_before
-        if status is Status.FINISHED and best is not None:
-            trajectory, loss = self._execute(state, candidates[best])
-            # A warm-started loss may flatter its plan.
-            if not loss < loss_before:
-                trajectory, loss, status = None, loss_before, Status.NO_IMPROVEMENT
-        clock.lap("execution")
-        if trajectory is not None and best is not None and self.refinement is not None:
-            refined = self._refine(self.refinement, index, state, candidates[best], loss_before)
-            evaluations += refined.plans.gradient_evaluations
-            history.extend(refined.plans.history)
-            if refined.trajectory is not None:
-                trajectory, loss = refined.trajectory, refined.loss
-                candidates[best] = dataclasses.replace(candidates[best], actions=trajectory.actions[0], loss=loss)
-            clock.lap("refinement")
-        seconds["total"] = clock.total()
-        finished = trajectory is not None
-        return StageResult(
-            index=index,
-            status=status,
-            state_before=state,
-            state=trajectory.final_state if trajectory is not None else state,
-            priorities=priorities,
-            candidates=tuple(candidates),
-            best=best if finished else None,
-            actions=trajectory.actions[0] if trajectory is not None else None,
-            positions=trajectory.positions[0] if trajectory is not None else None,
-            manipulator_poses=trajectory.manipulator_poses[0] if trajectory is not None else None,
-            loss_before=loss_before,
-            loss=loss,
-            gradient_evaluations=evaluations,
-            history=tuple(history),
-            seconds=seconds,
+        best = min(range(len(candidates)), key=lambda number: candidates[number].loss, default=None)
+        execution = _Execution(bench.stage.loss, bench.warm)
+        status = _search_status(candidates, best, bench.stage.loss)
+        if best is not None and status is Status.FINISHED:
+            status = self._execute(bench, self._phases("round")[-1], candidates[best], execution)
+        bench.lap("execution")
+        if best is not None and status is Status.FINISHED:
+            for phase in self._phases("stage"):
+                for changed in phase.run(bench, [candidates[best]]):
+                    self._execute(bench, phase, changed, execution)
+                bench.lap(phase.name)
+            candidates[best] = execution.candidate or candidates[best]
+        return _stage_result(bench, candidates, best, status, execution)
+
+    def execute_other(self, result: StageResult, number: int) -> StageResult | None:
+        """What a stage would have come to by another of its candidates, for loops that follow several ways at once.
+
+        Args:
+            result: A stage.
+            number: Which of its candidates.
+
+        Returns:
+            The stage with that candidate executed; None where it gains nothing.
+        """
+        candidate = result.candidates[number]
+        before = result.state_before
+        trajectory = self.simulator.rollout(
+            before.with_manipulators(candidate.proposal.pose.unsqueeze(0)), candidate.actions.unsqueeze(0).to(before.position)
+        )
+        if not bool(torch.isfinite(trajectory.positions).all()):
+            return None
+        found = self.objective.evaluate(trajectory)
+        if not float(found.loss[0]) < result.loss_before:
+            return None
+        return dataclasses.replace(
+            result,
+            state=trajectory.final_state,
+            best=number,
+            actions=trajectory.actions[0],
+            positions=trajectory.positions[0],
+            manipulator_poses=trajectory.manipulator_poses[0],
+            loss=float(found.loss[0]),
+            warm=found.warm,
         )
 
-    def _optimize(
-        self, index: int, state: State, placements: list[Placement], generator: torch.Generator
-    ) -> list[OptimizationResult]:
-        """Solve all placements, as many worlds at a time as the simulator holds."""
-        # All first actions are drawn at once, so that the result does not depend on how many worlds fit into a batch.
-        shape = (len(placements), self.task.step_count, self.task.scene.action_size)
-        first_actions = self.optimizer.initial_actions(shape, generator)
-        first_actions = torch.nn.functional.pad(first_actions, (0, 0, 0, self.task.rest_steps))
-        found = []
-        for start in range(0, len(placements), self.simulator.batch_size):
-            part = placements[start : start + self.simulator.batch_size]
-            worlds = state.fork(len(part)).with_manipulators(torch.stack([placement.pose for placement in part]))
-            actions = first_actions[start : start + len(part)]
-            estimate = self.simulator.memory_estimate(self.task.rollout_steps, worlds=len(part))
-            for observer in self.observers:
-                observer.optimization_started(index, len(part), estimate)
-            self.objective.reset()
-            found.append(
-                self.optimizer.minimize(
-                    self.simulator,
-                    worlds,
-                    actions,
-                    self.objective,
-                    rest_steps=self.task.rest_steps,
-                    on_iteration=self._notifier(index),
-                )
-            )
-        return found
+    def _workbench(
+        self, start: Start, index: int, state: State, before: Sequence[StageResult], warm: tuple[object, ...] | None
+    ) -> Workbench:
+        """What the phases of a stage work with, transport solved."""
+        generator, failed = stage_generator(self.seed, index), failed_contacts([*start.previous, *before])
+        stage = Stage(index, self.task.scene, state, start.target, None, generator, failed_contacts=failed)
+        bench = Workbench(
+            stage=stage,
+            task=self.task,
+            simulator=self.simulator,
+            objective=self.objective,
+            executor=self.executor,
+            on_iteration=lambda iteration: self._tell_iteration(index, iteration),
+            on_batch=lambda worlds, memory: self._tell_batch(index, worlds, memory),
+        )
+        begin = self.objective.evaluate(still_trajectory(state, self.task.rollout_steps, scene=self.task.scene), warm)
+        # "priorities f = optimal-transport potentials between current shape S_i and goal G"
+        wanted = self.placer.transport_problem is not None
+        transport = self.ot_solver.solve(state.position[0], start.target) if wanted else None
+        bench.stage, bench.warm = dataclasses.replace(stage, transport=transport, loss=float(begin.loss[0])), begin.warm
+        bench.lap("transport")
+        return bench
 
-    def _refine(self, refinement: Refinement, index: int, state: State, candidate: PlacementResult, loss_before: float) -> _Refined:
-        """Refine a plan, and execute what was found if the refinement's objective fell and the stage's is below its start's."""
-        start = state.with_manipulators(candidate.placement.pose.unsqueeze(0))
-        rest, notify = self.task.rest_steps, self._notifier(index)
-        plans = refinement.refine(self.simulator, start, candidate.actions, rest_steps=rest, on_iteration=notify)
-        if not gained(plans):
-            return _Refined(plans, None, loss_before)
-        trajectory, loss = self._execute(state, dataclasses.replace(candidate, actions=plans.actions[0]))
-        return _Refined(plans, trajectory if loss < loss_before else None, loss)
+    def _search(self, bench: Workbench) -> list[Candidate]:
+        """All candidates of a stage, round by round."""
+        candidates: list[Candidate] = []
+        while True:
+            # "p = particle with the largest priority; place the tools around p: best score, no collision with the body"
+            proposals = self.placer.ask(bench.stage)
+            bench.lap("placement")
+            if not proposals:
+                return candidates
+            # "for each candidate pose in T: actions, loss = minimise the shape loss through the simulator"
+            found = [Candidate(proposal, float("nan"), proposal.pose.new_empty(0)) for proposal in proposals]
+            for phase in self._phases("round"):
+                found = phase.run(bench, found)
+            candidates += found
+            bench.lap("optimization")
+            if not self.placer.tell(found):
+                return candidates
 
-    def _notifier(self, index: int) -> Callable[[Iteration], None]:
-        def notify(iteration: Iteration) -> None:
-            for observer in self.observers:
-                observer.iteration_finished(index, iteration)
+    def _execute(self, bench: Workbench, phase: Phase, candidate: Candidate, execution: _Execution) -> Status:
+        """Execute a plan and keep what came of it, if its phase accepts that."""
+        trajectory, loss, warm = bench.execute(candidate)
+        if not np.isfinite(loss):
+            return Status.NON_FINITE
+        # A warm-started loss may flatter its plan.
+        if not phase.accepts(loss, loss_before=bench.stage.loss, loss_now=execution.loss):
+            return Status.NO_IMPROVEMENT
+        execution.trajectory, execution.loss, execution.warm = trajectory, loss, warm
+        if phase.scope == "stage":
+            execution.candidate = dataclasses.replace(candidate, actions=trajectory.actions[0], loss=loss)
+        return Status.FINISHED
 
-        return notify
+    def _phases(self, scope: str) -> list[Phase]:
+        return [phase for phase in self.phases if phase.scope == scope]
 
-    def _execute(self, state: State, candidate: PlacementResult) -> tuple[Trajectory, float]:
-        """Run the chosen plan once more, as a single world, and take its loss by a fresh (not warm-started) evaluation."""
-        start = state.with_manipulators(candidate.placement.pose.unsqueeze(0))
-        trajectory = self.simulator.rollout(start, candidate.actions.unsqueeze(0))
-        return trajectory, float(self.objective.begin(trajectory).loss[0])
+    def _tell_iteration(self, index: int, iteration: Iteration) -> None:
+        for observer in self.observers:
+            observer.iteration_finished(index, iteration)
+
+    def _tell_batch(self, index: int, worlds: int, memory: int) -> None:
+        for observer in self.observers:
+            observer.optimization_started(index, worlds, memory)
+
+
+def contact_points_discovery(planner: Planner, start: Start) -> Iterator[StageResult]:
+    """The loop of Algorithm 1: execute each stage's best plan and go on from there; a stage that fails is the last one.
+
+    Args:
+        planner: The parts.
+        start: Where to begin.
+
+    Returns:
+        The result of each stage, as soon as it is known.
+    """
+    results: list[StageResult] = []
+    state, warm = start.state, None
+    # "for each stage:"
+    for index in range(start.first_stage, start.first_stage + start.stages):
+        result = planner.stage(start, index, state, results, warm=warm)
+        results.append(result)
+        yield result
+        if result.status is not Status.FINISHED:
+            return
+        state, warm = result.state, result.warm
 
 
 def stage_generator(seed: int, index: int) -> torch.Generator:
@@ -301,56 +318,22 @@ def failed_contacts(stages: Sequence[StageResult]) -> tuple[int, ...]:
     for stage in reversed(stages):
         if stage.loss < (1.0 - LEAST_GAIN) * stage.loss_before:
             break
-        contacts = [candidate.placement.contact_particle for candidate in stage.candidates]
+        contacts = [candidate.proposal.contact_particle for candidate in stage.candidates]
         found += [contact for contact in contacts if contact is not None]
     return tuple(dict.fromkeys(found))
 
 
-def check_tools_outside(scene: Scene, state: State) -> None:
-    """Raise `InputError` where a tool begins inside the body, from where the first step would throw the clay apart.
+@dataclasses.dataclass
+class _Execution:
+    """The plan that a stage has executed so far: none at first, when its loss is that of leaving the state as it is."""
 
-    Args:
-        scene: Its tools.
-        state: The scene's start, a single world.
-    """
-    for index, manipulator in enumerate(scene.manipulators):
-        depth = -float(signed_distance(manipulator, state.manipulator_pose[0, index], state.position[0]).min())
-        if depth > MAX_START_DEPTH:
-            raise InputError(
-                f"scene.manipulators.{index}",
-                came=f"a {manipulator.kind} that starts {depth:.3g} length units deep inside the body",
-                expected=f"a tool outside of it (at most {MAX_START_DEPTH:g} deep)",
-                remedy=f"Change its position, for example with --set scene.manipulators.{index}.position=[x,y,z].",
-            )
+    loss: float
+    warm: tuple[object, ...] | None
+    trajectory: Trajectory | None = None
+    candidate: Candidate | None = None
 
 
-def still_trajectory(state: State, step_count: int, *, scene: Scene) -> Trajectory:
-    """A trajectory of `step_count` steps during which nothing moves, to take the loss of a state.
-
-    Only its last step arrives with the velocity of the state, for an objective that asks whether the clay is at rest.
-    """
-    worlds = state.batch_size
-    positions = state.position.unsqueeze(1).repeat(1, step_count + 1, 1, 1)
-    seconds = scene.time_step * scene.substeps
-    positions[:, -2] = (state.position - seconds * state.velocity).clamp(0.0, 1.0)
-    return Trajectory(
-        positions=positions,
-        manipulator_poses=state.manipulator_pose.unsqueeze(1).expand(-1, step_count + 1, -1, -1),
-        actions=torch.zeros(worlds, step_count, scene.action_size, dtype=state.position.dtype, device=state.position.device),
-        initial_state=state,
-        final_state=state,
-    )
-
-
-def _pair(placements: list[Placement], found: Iterable[OptimizationResult]) -> list[PlacementResult]:
-    plans = [plan for result in found for plan in zip(result.loss, result.actions, result.finite, strict=True)]
-    return [
-        PlacementResult(placement, float(loss), actions, bool(finite))
-        for placement, (loss, actions, finite) in zip(placements, plans, strict=True)
-    ]
-
-
-def _stage_status(candidates: list[PlacementResult], best: int | None, loss_before: float) -> Status:
+def _search_status(candidates: Sequence[Candidate], best: int | None, loss_before: float) -> Status:
     if best is None:
         return Status.NO_PLACEMENT
     if candidates[best].loss < loss_before:
@@ -358,26 +341,28 @@ def _stage_status(candidates: list[PlacementResult], best: int | None, loss_befo
     return Status.NO_IMPROVEMENT if any(candidate.finite for candidate in candidates) else Status.NON_FINITE
 
 
-@dataclasses.dataclass(frozen=True)
-class _Refined:
-    """Plans of a refinement, and the execution of the best one; None where the plan stays as it was."""
-
-    plans: OptimizationResult
-    trajectory: Trajectory | None
-    loss: float
-
-
-class _Clock:
-    """Adds the wall time since the last lap to named entries."""
-
-    def __init__(self, seconds: dict[str, float]) -> None:
-        self._seconds = seconds
-        self._start = self._mark = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self._seconds[name] = self._seconds.get(name, 0.0) + now - self._mark
-        self._mark = now
-
-    def total(self) -> float:
-        return time.perf_counter() - self._start
+def _stage_result(
+    bench: Workbench, candidates: list[Candidate], best: int | None, status: Status, execution: _Execution
+) -> StageResult:
+    """What a stage came to; without an executed plan its state is the one before."""
+    trajectory, state = execution.trajectory, bench.stage.state
+    bench.seconds["total"] = bench.total()
+    return StageResult(
+        index=bench.stage.index,
+        status=status,
+        state_before=state,
+        state=state if trajectory is None else trajectory.final_state,
+        priorities=bench.stage.priorities,
+        candidates=tuple(candidates),
+        best=None if trajectory is None else best,
+        actions=None if trajectory is None else trajectory.actions[0],
+        positions=None if trajectory is None else trajectory.positions[0],
+        manipulator_poses=None if trajectory is None else trajectory.manipulator_poses[0],
+        loss_before=bench.stage.loss,
+        loss=execution.loss,
+        gradient_evaluations=bench.gradient_evaluations,
+        rollouts=bench.rollouts,
+        history=tuple(bench.history),
+        seconds=bench.seconds,
+        warm=execution.warm,
+    )

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-from pathlib import Path
 
 from torch import Tensor
 
 from cpdeform.core.memory import MemoryUse
-from cpdeform.core.placer import PlacementResult
+from cpdeform.core.placer import Candidate
 from cpdeform.core.state import State
 from cpdeform.core.task import Task
 from cpdeform.planning.optimizer import Iteration
@@ -65,8 +64,10 @@ class StageResult:
         loss: Loss of the executed plan; `loss_before` where none was executed.
         gradient_evaluations: Gradient evaluations of this stage, all worlds.
         history: Every iteration of the optimiser, per round of candidates.
-        seconds: Wall time of the parts `transport`, `placement`, `optimization`, `execution`, `refinement` (where there is
-            one) and `total`.
+        seconds: Wall time of the parts `transport`, `placement`, `optimization`, `execution`, of further phases by their names
+            (`refinement`), and `total`.
+        rollouts: Rollouts without a gradient of this stage, all worlds, executions included.
+        warm: What the objective can start from at the stage's end; None for a stage read from a record.
     """
 
     index: int
@@ -74,7 +75,7 @@ class StageResult:
     state_before: State
     state: State
     priorities: Tensor
-    candidates: tuple[PlacementResult, ...]
+    candidates: tuple[Candidate, ...]
     best: int | None
     actions: Tensor | None
     positions: Tensor | None
@@ -84,6 +85,8 @@ class StageResult:
     gradient_evaluations: int
     history: tuple[Iteration, ...]
     seconds: dict[str, float]
+    rollouts: int = 0
+    warm: tuple[object, ...] | None = dataclasses.field(default=None, repr=False, compare=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,8 +104,9 @@ class DeformResult:
         metric_initial: Its value at the scene's start, also for a run that goes on from a record.
         metric_value: Its value at the end.
         gradient_evaluations: Gradient evaluations of all stages and worlds.
+        rollouts: Rollouts without a gradient of all stages and worlds, executions included.
         seconds: Wall time of the run.
-        names: Names or classes of the parts used: ``backend``, ``ot``, ``placer``.
+        names: Names or classes of the parts used: ``backend``, ``ot``, ``placer``, ``strategy``.
         seed: The seed.
     """
 
@@ -116,6 +120,7 @@ class DeformResult:
     metric_initial: float
     metric_value: float
     gradient_evaluations: int
+    rollouts: int
     seconds: float
     names: dict[str, str]
     seed: int
@@ -130,18 +135,6 @@ class DeformResult:
         """Memory of the rollouts and gradients of the largest batch; None where no iteration measured it."""
         uses = [iteration.memory for stage in self.stages for iteration in stage.history if iteration.memory is not None]
         return max(uses, key=lambda use: (use.estimate, use.peak or 0), default=None)
-
-    def save(self, directory: str | Path) -> Path:
-        """Write the run record (configuration, metrics, states, actions) to a new directory and return its path.
-
-        `cpdeform.report.draw_run` adds the picture and the animation.
-
-        Raises:
-            InputError: The directory exists and is not empty, or cannot be written.
-        """
-        from cpdeform.run.record import save_result
-
-        return save_result(self, Path(directory))
 
 
 class Observer:

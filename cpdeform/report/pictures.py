@@ -73,7 +73,7 @@ def draw_picture(record: RunRecord) -> Path:
     axes = figure.subplots(1, 4)
     stage, last = _shown_stage(record), record.stages[-1]
     start, result = record.stages[0].state_before, last.state
-    placed = stage.candidates[stage.best].placement.pose if stage.best is not None else stage.state_before.manipulator_pose[0]
+    placed = stage.candidates[stage.best].proposal.pose if stage.best is not None else stage.state_before.manipulator_pose[0]
     _draw_panel(axes[0], view, record, "start", start.position[0], start.manipulator_pose[0])
     _draw_priorities(figure, axes[1], view, record, stage, placed)
     title = "result" if last.status is Status.FINISHED or record.finished_stages else "result (no plan was executed)"
@@ -110,7 +110,7 @@ def make_view(record: RunRecord) -> View:
     target = record.target.double().numpy()
     clouds = [target] + [_numbers(state.position[0]) for stage in record.stages for state in (stage.state_before, stage.state)]
     poses = [_numbers(state.manipulator_pose[0]) for stage in record.stages for state in (stage.state_before, stage.state)]
-    poses += [_numbers(stage.candidates[stage.best].placement.pose) for stage in record.stages if stage.best is not None]
+    poses += [_numbers(stage.candidates[stage.best].proposal.pose) for stage in record.stages if stage.best is not None]
     shapes = [surface.reshape(-1, 3) for pose in poses for surface in tool_surfaces(record, pose, rows=16, columns=32)]
     everything = np.concatenate(clouds + shapes)
     everything = everything[np.isfinite(everything).all(axis=1)]

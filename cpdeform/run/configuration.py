@@ -3,49 +3,28 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
 from pydantic import Field, PositiveFloat, field_validator
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.plugins import AUTO
-from cpdeform.core.priorities import PriorityKind
 from cpdeform.core.scene import FrozenModel
-from cpdeform.core.task import Task, merge, validate
 from cpdeform.planning.objectives.contact import ContactKind
 
-PAPER_SETTINGS: Mapping[str, Any] = MappingProxyType(
-    {
-        "optimizer": {"schedule": "paper", "backtrack": None},
-        "objective": {"axis_scale": (1.0, 1.0, 1.0), "coast_steps": 0.0},
-        "refinement": {"iterations": 0},
-    }
-)
-"""What ``algorithm=paper`` sets where the user does not: Algorithm 1 to the letter."""
-
-PAPER_PLACER_OPTIONS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {
-        "transport": MappingProxyType(
-            {"distance_scale": 1.0, "max_gap": None, "poses": None, "attempts": 1, "contacts": 1, "least_gain": 0.0}
-        ),
-        "random": MappingProxyType({"rounds": 1}),
-    }
-)
-"""Options of placers with ``algorithm=paper``: a single contact point a stage; poses: the placer's own, by the number of tools."""
+DEFAULT_STRATEGY = "cpdeform"
 
 
 class OptimizerConfiguration(FrozenModel):
-    """Options of `cpdeform.planning.optimizer.TrajectoryOptimizer`; see there."""
+    """Options of `cpdeform.planning.optimizer.TrajectoryOptimizer`; see there. `pruner` is a name of `make_pruner`."""
 
     iterations: int = Field(default=40, ge=1)
     learning_rate: float = Field(default=0.1, gt=0.0)
     patience: int = Field(default=15, ge=1)
     tolerance: float = Field(default=1e-3, ge=0.0)
     initial_noise: float = Field(default=0.01, ge=0.0)
-    schedule: Literal["halving", "paper"] = "halving"
+    pruner: Literal["halving", "none"] = "halving"
     backtrack: int | None = Field(default=4, ge=1)
 
 
@@ -55,14 +34,14 @@ class PrioritiesConfiguration(FrozenModel):
     Attributes:
         kind: ``"potential"``: the dual potentials of the cost |x - y| (the paper); ``"displacement"``: the distance that transport
             of the cost |x - y|^2 moves each particle, from a solver with an option `exponent`. See
-            `cpdeform.core.priorities.transport_priorities`.
-        blur: Entropic blur of the transport problem, length units. The larger, the quicker and the smoother; up to half a
-            centimetre the potentials' peak stays at the particles that have to move, displacements allow for two.
+            `cpdeform.core.priorities.transport_priorities`. Defaults to what the placer declares (`Placer.transport_problem`).
+        blur: Entropic blur of the transport problem, length units; defaults to what the placer declares. The larger, the quicker
+            and the smoother; up to half a centimetre the potentials' peak stays at the particles that have to move, displacements
+            allow for two.
     """
 
-    kind: PriorityKind = "potential"
-
-    blur: float = Field(default=5e-3, gt=0.0)
+    kind: Literal["potential", "displacement"] | None = None
+    blur: float | None = Field(default=None, gt=0.0)
 
 
 class ObjectiveConfiguration(FrozenModel):
@@ -84,7 +63,7 @@ class ObjectiveConfiguration(FrozenModel):
     """
 
     kind: Literal["transport", "plasticinelab"] = "transport"
-    points: int | None = Field(default=2000, ge=1)
+    points: int | None = Field(default=10000, ge=1)
     blur: float = Field(default=2e-3, gt=0.0)
     refresh: int = Field(default=50, ge=1)
     contact_weight: float | None = Field(default=None, ge=0.0)
@@ -97,9 +76,9 @@ class RefinementConfiguration(FrozenModel):
     """How a stage's best plan is refined, by another objective than the one that found it.
 
     Attributes:
-        kind: ``"density"``: the share of misplaced mass, see `cpdeform.planning.objectives.density`; ``"iou"``: PlasticineLab's soft
-            IoU, see `cpdeform.planning.objectives.soft_iou`; ``"transport"``: the transport cost of all particles as it is, without
-            what a task adds to it for the search (factors of the coordinates, coasting).
+        kind: ``"density"``: the share of misplaced mass, see `cpdeform.planning.objectives.density`; ``"iou"``: PlasticineLab's
+            soft IoU, see `cpdeform.planning.objectives.soft_iou`; ``"transport"``: the transport cost of all particles as it is,
+            without what the search's loss adds to it (factors of the coordinates, coasting).
         iterations: The most gradient evaluations, and never more than the search's; 0 for no refinement.
         learning_rate: Adam's step size, in units of action.
         patience: Stop when nothing improved for this many iterations.
@@ -125,7 +104,8 @@ class RunConfiguration(FrozenModel):
         steps: Environment steps of a stage; the task's own where absent.
         rest_steps: Environment steps of rest after them; the task's own where absent.
         target: File of the goal instead of the task's own, e.g. one written by `cpdeform task import-grid`.
-        algorithm: ``"cpdeform"``, or ``"paper"`` for Algorithm 1 to the letter (`PAPER_SETTINGS`, `PAPER_PLACER_OPTIONS`).
+        strategy: Registered name of the strategy: ``"cpdeform"``, or ``"paper"`` for Algorithm 1 to the letter. What it sets, the
+            user overrides.
         optimizer: Options of the optimiser.
         objective: Options of the loss.
         priorities: Options of the transport priorities.
@@ -134,6 +114,7 @@ class RunConfiguration(FrozenModel):
         simulator_options: Further keyword options of the simulator.
         ot_options: Further keyword options of the transport solver that gives the priorities.
         placer_options: Keyword options of the placer.
+        strategy_options: Keyword options of the strategy.
     """
 
     task: str = "writer"
@@ -146,7 +127,7 @@ class RunConfiguration(FrozenModel):
     steps: int | None = Field(default=None, ge=1)
     rest_steps: int | None = Field(default=None, ge=0)
     target: Path | None = None
-    algorithm: Literal["cpdeform", "paper"] = "cpdeform"
+    strategy: str = DEFAULT_STRATEGY
     optimizer: OptimizerConfiguration = OptimizerConfiguration()
     objective: ObjectiveConfiguration = ObjectiveConfiguration()
     priorities: PrioritiesConfiguration = PrioritiesConfiguration()
@@ -155,6 +136,7 @@ class RunConfiguration(FrozenModel):
     simulator_options: dict[str, Any] = Field(default_factory=dict)
     ot_options: dict[str, Any] = Field(default_factory=dict)
     placer_options: dict[str, Any] = Field(default_factory=dict)
+    strategy_options: dict[str, Any] = Field(default_factory=dict)
 
     @field_validator("device")
     @classmethod
@@ -162,29 +144,3 @@ class RunConfiguration(FrozenModel):
         if not re.fullmatch(r"cpu|cuda(:\d+)?", value):
             raise InputError("device", came=f'"{value}"', expected='"cpu", "cuda" or "cuda:N"')
         return value
-
-
-def with_task_settings(configuration: RunConfiguration, task: Task) -> RunConfiguration:
-    """Fill in, where the user set nothing, what the algorithm prescribes and then what the task's `settings` say.
-
-    A task's changes of its own scene are limits that a plan keeps to, such as slower tools; ``algorithm=paper`` has the scene as
-    it is, and the default priorities.
-
-    Args:
-        configuration: What the user set; fields that were not set do not count.
-        task: The task to be run.
-
-    Raises:
-        InputError: The task's settings do not fit.
-    """
-    given = configuration.model_dump(exclude_unset=True)
-    base = dict(task.settings)
-    placer = given.get("placer", base.get("placer", configuration.placer))
-    if placer != base.get("placer", "transport"):
-        base.pop("placer_options", None)
-    if configuration.algorithm == "paper":
-        for field in ("scene", "priorities"):
-            base.pop(field, None)
-        base = merge(base, PAPER_SETTINGS)
-        base = merge(base, {"placer_options": PAPER_PLACER_OPTIONS.get(placer, {})})
-    return validate(RunConfiguration, merge(base, given), source=f"task {task.name}: settings")

@@ -49,7 +49,7 @@ from cpdeform.run.record_stage import write_stage
 
 __all__ = ["RunRecord", "RunRecorder", "load_record", "save_result"]
 
-FORMAT = 1
+FORMAT = 2
 """Version of the record's layout."""
 
 
@@ -109,7 +109,8 @@ class RunRecorder(Observer):
                 "recorded_at": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
                 **environment(),
                 "configuration": self._configuration.model_dump(mode="json") if self._configuration else None,
-                "task": task.model_dump(mode="json"),
+                # The goal is the copy beside this file.
+                "task": {**task.model_dump(mode="json"), "target": TARGET_FILE},
             }
             with replacing(self.directory / TARGET_FILE) as temporary, h5py.File(temporary, "w") as file:
                 write_dataset(file, "position", target, shape="particle, xyz", units="length (domain edge = 1)")
@@ -157,9 +158,10 @@ class RunRecorder(Observer):
                 "loss_before": result.loss_before,
                 "loss": result.loss,
                 "best": result.best,
-                "candidates": [candidate.placement.label for candidate in result.candidates],
+                "candidates": [candidate.proposal.label for candidate in result.candidates],
                 "candidate_loss": [candidate.loss for candidate in result.candidates],
                 "gradient_evaluations": result.gradient_evaluations,
+                "rollouts": result.rollouts,
                 "seconds": result.seconds,
             }
         )
@@ -179,6 +181,7 @@ class RunRecorder(Observer):
             metric_initial=result.metric_initial,
             metric_value=result.metric_value,
             gradient_evaluations=result.gradient_evaluations,
+            rollouts=result.rollouts,
             seconds=result.seconds,
         )
 
@@ -238,7 +241,12 @@ def _origin(record: RunRecord | None) -> dict[str, Any] | None:
 
 
 def save_result(
-    result: DeformResult, directory: Path, *, configuration: RunConfiguration | None = None, overwrite: bool = False
+    result: DeformResult,
+    directory: Path,
+    *,
+    configuration: RunConfiguration | None = None,
+    overwrite: bool = False,
+    resumed_from: RunRecord | None = None,
 ) -> Path:
     """Write the record of a run that is over, the same as `RunRecorder` writes during one.
 
@@ -247,6 +255,7 @@ def save_result(
         directory: Where to write; made if missing.
         configuration: What defined the run, kept in the record.
         overwrite: As for `RunRecorder`.
+        resumed_from: The record that the run went on from.
 
     Returns:
         The directory.
@@ -255,7 +264,7 @@ def save_result(
         InputError: The directory is not empty (without `overwrite`) or cannot be written.
         RecordError: Writing failed on the way, e.g. because the disk is full.
     """
-    recorder = RunRecorder(directory, configuration=configuration, overwrite=overwrite)
+    recorder = RunRecorder(directory, configuration=configuration, overwrite=overwrite, resumed_from=resumed_from)
     recorder.run_started(result.task, result.target, result.names, result.seed)
     for stage in result.stages:
         for iteration in stage.history:

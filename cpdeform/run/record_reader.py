@@ -14,6 +14,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.state import State
 from cpdeform.core.task import Task, validate
 from cpdeform.planning.result import StageResult, Status
+from cpdeform.run.migration import current_task
 from cpdeform.run.record_files import METRICS_FILE, RUN_FILE, TARGET_FILE, read_tensor, stage_files
 from cpdeform.run.record_stage import read_stage
 
@@ -25,7 +26,7 @@ class RunRecord:
     Attributes:
         directory: Where it lies.
         run: Content of ``run.json``: status, versions, machine, configuration, losses; null for a number that is not finite.
-        task: What was asked for.
+        task: What was asked for; its goal is the record's copy.
         target: Goal particles (M, 3), length units.
         metrics: Lines of ``metrics.jsonl``, iterations and stages in the order of time.
         stages: Stages that are complete, in order; their `history` is empty, see `metrics`.
@@ -37,6 +38,11 @@ class RunRecord:
     target: Tensor
     metrics: tuple[dict[str, Any], ...]
     stages: tuple[StageResult, ...]
+
+    @property
+    def format(self) -> int:
+        """Version of the layout that the record was written in."""
+        return int(self.run.get("format", 1))
 
     @property
     def status(self) -> str:
@@ -57,7 +63,7 @@ class RunRecord:
     def state(self) -> State:
         """State after the last complete stage, a single world on the CPU.
 
-        To go on from it: ``deform(..., state=record.state, first_stage=record.next_stage)``, or ``cpdeform run --resume``.
+        To go on from it: ``deform(resume=record)``, or ``cpdeform run --resume``.
 
         Raises:
             InputError: No stage is complete.
@@ -80,7 +86,10 @@ def load_record(directory: Path | str) -> RunRecord:
     run = _read_run(directory)
     argument = f"run record {directory}"
     try:
-        task = validate(Task, run["task"], source=f"{argument}: task")
+        content = current_task(run["task"], record_format=run.get("format", 1))
+        task = validate(Task, content, source=f"{argument}: task")
+        # The goal is the record's own copy, wherever the record lies now.
+        task = task.model_copy(update={"target": directory / TARGET_FILE})
         with h5py.File(directory / TARGET_FILE, "r") as file:
             target = read_tensor(file, "position")
         stages = tuple(read_stage(path) for path in stage_files(directory))

@@ -10,7 +10,7 @@ import h5py
 import torch
 from torch import Tensor
 
-from cpdeform.core.placer import Placement, PlacementResult
+from cpdeform.core.placer import Candidate, Proposal
 from cpdeform.core.state import State
 from cpdeform.planning.result import StageResult, Status
 from cpdeform.run.record_files import read_tensor, replacing, to_json, write_dataset
@@ -35,6 +35,7 @@ def write_stage(path: Path, result: StageResult) -> None:
         file.attrs["loss_before"] = result.loss_before
         file.attrs["loss"] = result.loss
         file.attrs["gradient_evaluations"] = result.gradient_evaluations
+        file.attrs["rollouts"] = result.rollouts
         file.attrs["seconds"] = json.dumps(to_json(result.seconds))
         for name, state in (("state_before", result.state_before), ("state", result.state)):
             group = file.create_group(name)
@@ -57,8 +58,8 @@ def write_stage(path: Path, result: StageResult) -> None:
             )
 
 
-def _write_candidates(group: h5py.Group, candidates: tuple[PlacementResult, ...]) -> None:
-    placements = [candidate.placement for candidate in candidates]
+def _write_candidates(group: h5py.Group, candidates: tuple[Candidate, ...]) -> None:
+    placements = [candidate.proposal for candidate in candidates]
     particles = [-1 if placement.contact_particle is None else placement.contact_particle for placement in placements]
     write_dataset(
         group, "pose", torch.stack([item.pose for item in placements]), shape="candidate, tool, xyz wxyz gap", units=POSE_UNITS
@@ -101,6 +102,7 @@ def read_stage(path: Path) -> StageResult:
             gradient_evaluations=int(file.attrs["gradient_evaluations"]),
             history=(),
             seconds=json.loads(file.attrs["seconds"]),
+            rollouts=int(file.attrs.get("rollouts", 0)),
         )
 
 
@@ -112,11 +114,11 @@ def _read_optional(file: h5py.File, name: str) -> Tensor | None:
     return read_tensor(file, name) if name in file else None
 
 
-def _read_candidates(group: h5py.Group) -> tuple[PlacementResult, ...]:
+def _read_candidates(group: h5py.Group) -> tuple[Candidate, ...]:
     poses, actions = read_tensor(group, "pose"), read_tensor(group, "actions")
     labels = group["label"].asstr()[()]
     rows = zip(poses, actions, group["score"][()], group["loss"][()], group["contact_particle"][()], labels, strict=True)
     return tuple(
-        PlacementResult(Placement(pose, float(score), str(label), None if particle < 0 else int(particle)), float(loss), plan)
+        Candidate(Proposal(pose, float(score), str(label), None if particle < 0 else int(particle)), float(loss), plan)
         for pose, plan, score, loss, particle, label in rows
     )

@@ -7,39 +7,25 @@ a stage depend on seed and number alone, so that a run that is resumed equals on
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.plugins import AUTO, Registry
-from cpdeform.core.state import State
-from cpdeform.core.task import Task, changed_task, load_task, merge, validate
+from cpdeform.core.plugins import AUTO
+from cpdeform.core.task import Task, changed_task, limited_task, merge, validate
 from cpdeform.run.configuration import RunConfiguration
-from cpdeform.run.record_files import TARGET_FILE
+from cpdeform.run.migration import current_configuration
 from cpdeform.run.record_reader import RunRecord
 
-OPTIONS_OF = {"backend": "simulator_options", "ot": "ot_options", "placer": "placer_options"}
-"""Options that go with a part; they are dropped where another part takes its place."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Resumption:
-    """What a run that goes on begins with.
-
-    Attributes:
-        record: The run's record.
-        task: Its task, with the changes of the scene asked for; its goal is the record's copy.
-        state: Where to start, a single world.
-        first_stage: Number of the first stage.
-    """
-
-    record: RunRecord
-    task: Task
-    state: State
-    first_stage: int
+OPTIONS_OF = {
+    "backend": ("simulator_options",),
+    "ot": ("ot_options",),
+    "placer": ("placer_options",),
+    "strategy": ("strategy_options", "placer_options", "optimizer", "objective", "priorities", "refinement"),
+}
+"""Fields that go with a part; where another part takes its place, the record's are dropped."""
 
 
 def resumed_values(record: RunRecord, changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -55,9 +41,9 @@ def resumed_values(record: RunRecord, changes: Mapping[str, Any]) -> dict[str, A
         InputError: The record's configuration cannot be used.
     """
     base = recorded_configuration(record).model_dump(mode="json")
-    for part, options in OPTIONS_OF.items():
+    for part, fields in OPTIONS_OF.items():
         if part in changes and changes[part] != base[part]:
-            base[options] = {}
+            base = {field: value for field, value in base.items() if field not in fields}
     planned = base["stages"] or record.task.stage_count
     base["stages"] = max(planned - record.finished_stages, 1)
     return merge(base, changes)
@@ -73,19 +59,16 @@ def recorded_configuration(record: RunRecord) -> RunConfiguration:
     if content is None:
         content = {**names, "task": record.task.name, "seed": record.run.get("seed", 0)}
     elif isinstance(content, dict):
+        content = current_configuration(content, record_format=record.format)
         content = content | {name: value for name, value in names.items() if content.get(name) == AUTO}
     return validate(RunConfiguration, content, source=f"run record {record.directory}: configuration")
 
 
-def make_resumption(record: RunRecord, configuration: RunConfiguration) -> Resumption:
-    """Put together what a run that goes on begins with.
-
-    Args:
-        record: The record.
-        configuration: That of the run to come; its scene changes apply to the record's task.
+def resumed_task(record: RunRecord) -> Task:
+    """The task of a record, to go on with.
 
     Raises:
-        InputError: The record has no complete stage, or a change of the scene does not fit.
+        InputError: The record has no complete stage.
     """
     if not record.stages:
         raise InputError(
@@ -94,27 +77,30 @@ def make_resumption(record: RunRecord, configuration: RunConfiguration) -> Resum
             expected="at least one, to go on from",
             remedy="Run the task from its start, without --resume.",
         )
-    task = record.task.model_copy(update={"target": record.directory / TARGET_FILE})
-    return Resumption(record, changed_task(task, scene=configuration.scene), record.state, record.next_stage)
+    return record.task
 
 
-def check_same_task(record: RunRecord, name: str, *, registry: Registry) -> None:
+def check_same_task(record: RunRecord, asked: Task) -> None:
     """Raise `InputError` unless a task is the one that a record was made with.
 
     Args:
         record: The record.
-        name: Registered name or path of the task that was asked for.
-        registry: Where the name is looked up.
+        asked: The task that was asked for, without the record's changes of its scene.
     """
     remedy = "Leave TASK out to go on with the record's own; change its scene with --set scene.<field>=<value>."
-    asked = load_task(name, registry=registry)
     if asked.name != record.task.name:
         expected = f'"{record.task.name}", the task of run record {record.directory}'
         raise InputError("TASK", came=f'"{asked.name}"', expected=expected, remedy=remedy)
-    asked = changed_task(asked, scene=recorded_configuration(record).scene)
-    given, recorded = asked.model_dump(), record.task.model_dump()
+    recorded = record.task.model_dump()
+    changes = recorded_configuration(record)
+    # Whether the limits were in force is the strategy's business, which the record does not know.
+    tasks = [
+        changed_task(task, scene=changes.scene, step_count=changes.steps, rest_steps=changes.rest_steps).model_dump()
+        for task in (limited_task(asked), asked)
+    ]
+    given = next((task for task in tasks if task["scene"] == recorded["scene"]), tasks[0])
     different = [field for field in ("scene", "step_count", "rest_steps", "metric") if given[field] != recorded[field]]
-    goal = torch.as_tensor(asked.load_target()).to(record.target)
+    goal = torch.as_tensor((asked if changes.target is None else record.task).load_target()).to(record.target)
     if goal.shape != record.target.shape or not torch.allclose(goal, record.target, atol=1e-6):
         different.append("target")
     if different:

@@ -1,4 +1,4 @@
-"""`check_placer`: does a placer keep the contract of `Placer` and `Placement`?"""
+"""`check_placer`: does a placer keep the contract of `Placer` and `Proposal`?"""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import CpdeformError
-from cpdeform.core.placer import Placement, PlacementResult, Placer, Stage
+from cpdeform.core.ot import OTResult
+from cpdeform.core.placer import Candidate, Placer, Proposal, Stage
 from cpdeform.core.scene import Scene
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
@@ -37,7 +38,7 @@ class PlacerBench:
 
     make: Callable[[], Placer]
     stage: Stage
-    placements: list[Placement]
+    placements: list[Proposal]
 
     @property
     def stays(self) -> bool:
@@ -45,7 +46,7 @@ class PlacerBench:
         return bool(self.placements) and all(_is_current(item, self.stage) for item in self.placements)
 
 
-def _is_current(placement: Placement, stage: Stage) -> bool:
+def _is_current(placement: Proposal, stage: Stage) -> bool:
     pose = stage.state.manipulator_pose[0]
     return placement.pose.shape == pose.shape and torch.allclose(placement.pose.to(pose), pose, atol=1e-7)
 
@@ -76,7 +77,21 @@ def make_stage(*, dtype: torch.dtype = torch.float64, fixed: bool = False, **cha
     priorities = 0.02 * torch.exp(-((distance / 0.03) ** 2))
     priorities = priorities - priorities.median()
     target = state.position[0] - torch.tensor([0.0, 0.01, 0.0]).to(state.position)
-    return Stage(0, scene, state, target, priorities, torch.Generator().manual_seed(0))
+    return Stage(0, scene, state, target, transport_of(priorities), torch.Generator().manual_seed(0))
+
+
+def transport_of(priorities: Tensor, displacements: Tensor | None = None) -> OTResult:
+    """A made-up solution whose priorities (N,) are these; of displacements (N, 3), if given, their lengths.
+
+    Args:
+        priorities: Potentials (N,), cost units; without meaning where displacements are given.
+        displacements: Where the transport moves each particle, length units.
+    """
+    count = priorities.shape[0]
+    gradient = torch.zeros(count, 3).to(priorities) if displacements is None else displacements * (-2.0 / count)
+    exponent = 1 if displacements is None else 2
+    value = torch.zeros((), dtype=priorities.dtype)
+    return OTResult(value, priorities, torch.zeros_like(priorities), gradient, True, 1, 0.0, 5e-3, exponent=exponent)
 
 
 def reseeded(stage: Stage, seed: int = 0, **changes: Any) -> Stage:
@@ -84,7 +99,7 @@ def reseeded(stage: Stage, seed: int = 0, **changes: Any) -> Stage:
     return dataclasses.replace(stage, generator=torch.Generator().manual_seed(seed), **changes)
 
 
-def _gap(placement: Placement, stage: Stage) -> float:
+def _gap(placement: Proposal, stage: Stage) -> float:
     """Least distance between a tool and a particle, negative inside."""
     points = stage.state.position[0].double()
     poses = placement.pose.double()
@@ -147,7 +162,7 @@ def check_fixed_tools(bench: PlacerBench) -> Finding:
     return Finding(max(moved), 1e-6)
 
 
-def _difference(first: Sequence[Placement], second: Sequence[Placement]) -> float:
+def _difference(first: Sequence[Proposal], second: Sequence[Proposal]) -> float:
     if len(first) != len(second):
         return math.inf
     differences = [float((one.pose.double() - other.pose.double()).abs().max()) for one, other in zip(first, second, strict=True)]
@@ -201,7 +216,7 @@ def check_rounds(bench: PlacerBench) -> Finding:
     placer, stage = bench.make(), reseeded(bench.stage)
     actions = torch.zeros(2, stage.scene.action_size)
     for count in range(ROUNDS):
-        results = [PlacementResult(item, 1.0 / (1 + index), actions) for index, item in enumerate(placer.ask(stage))]
+        results = [Candidate(item, 1.0 / (1 + index), actions) for index, item in enumerate(placer.ask(stage))]
         again = placer.tell(results)
         if not isinstance(again, bool):
             return Finding(1.0, 0.0, f"tell returned a {type(again).__name__}")
@@ -212,7 +227,7 @@ def check_rounds(bench: PlacerBench) -> Finding:
 
 PLACER_CHECKS: tuple[CheckItem[PlacerBench], ...] = (
     CheckItem("finds a placement where there is room", check_found, "The body's top is free: propose at least one placement."),
-    CheckItem("shapes and types of placements", check_shapes, "See the attributes of Placement."),
+    CheckItem("shapes and types of placements", check_shapes, "See the attributes of Proposal."),
     CheckItem(
         "no collision with the body", check_collision, "Test candidates with cpdeform.core.signed_distance against all particles."
     ),

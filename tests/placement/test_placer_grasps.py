@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.placer import Placement, PlacementResult, Stage
+from cpdeform.core.placer import Candidate, Proposal, Stage
 from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import BodyBox, ManipulatorBase, ManipulatorBox, ManipulatorSphere, Scene
 from cpdeform.core.signed_distance import signed_distance
@@ -47,13 +47,13 @@ def balls(*positions: tuple[float, float, float]) -> list[ManipulatorBase]:
     return [ManipulatorSphere(radius=0.03, position=position, action_scale=SCALE) for position in positions]
 
 
-def gaps(stage: Stage, placement: Placement) -> list[float]:
+def gaps(stage: Stage, placement: Proposal) -> list[float]:
     tools = zip(stage.scene.manipulators, placement.pose, strict=True)
     return [float(signed_distance(tool, pose, stage.state.position[0]).min()) for tool, pose in tools]
 
 
-def failed(placements: list[Placement], loss: float) -> list[PlacementResult]:
-    return [PlacementResult(placement, loss, torch.zeros(1, 6)) for placement in placements]
+def failed(placements: list[Proposal], loss: float) -> list[Candidate]:
+    return [Candidate(placement, loss, torch.zeros(1, 6)) for placement in placements]
 
 
 def test_plates_face_each_other_through_the_contact_point() -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.placer import PlacementResult, Stage
+from cpdeform.core.placer import Candidate, Stage
 from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import BodyBox, ManipulatorBox, ManipulatorSphere, Scene
 from cpdeform.core.signed_distance import signed_distance
@@ -115,7 +115,7 @@ def test_several_contact_points_are_near_each_other_and_not_the_same() -> None:
     assert len(placements) == 3
     lefts = sorted(float(placement.pose[:, 0].min()) for placement in placements)
     assert all(0.02 < second - first < 0.06 for first, second in itertools.pairwise(lefts))
-    results = [PlacementResult(placement, 1.0, torch.zeros(1, 6)) for placement in placements]
+    results = [Candidate(placement, 1.0, torch.zeros(1, 6)) for placement in placements]
     assert placer.tell(results)
     again = placer.ask(stage)
     assert not {placement.contact_particle for placement in placements} & {placement.contact_particle for placement in again}

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.placer import Placement, PlacementResult, Stage
+from cpdeform.core.placer import Candidate, Proposal, Stage
 from cpdeform.core.scene import BodyBox, BodySphere, ManipulatorSphere, Scene
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
@@ -25,7 +25,7 @@ def stage(seed: int = 0) -> Stage:
     return Stage(0, scene, state, state.position[0], nothing, torch.Generator().manual_seed(seed))
 
 
-def poses(placements: list[Placement]) -> torch.Tensor:
+def poses(placements: list[Proposal]) -> torch.Tensor:
     return torch.stack([placement.pose for placement in placements])
 
 
@@ -54,11 +54,11 @@ def test_other_particles_are_drawn_until_one_lowers_the_loss() -> None:
     for again in (True, True, False):
         placements = placer.ask(here)
         contacts += [placement.contact_particle for placement in placements]
-        assert placer.tell([PlacementResult(placement, 1.0, torch.zeros(1, 3)) for placement in placements]) is again
+        assert placer.tell([Candidate(placement, 1.0, torch.zeros(1, 3)) for placement in placements]) is again
     assert len(set(contacts)) == 3
     placements = placer.ask(dataclasses.replace(stage(), loss=1.0))
-    assert placer.tell([PlacementResult(placements[0], float("nan"), torch.zeros(1, 3), False)]) is True
-    assert placer.tell([PlacementResult(placements[0], 0.9, torch.zeros(1, 3))]) is False
+    assert placer.tell([Candidate(placements[0], float("nan"), torch.zeros(1, 3), False)]) is True
+    assert placer.tell([Candidate(placements[0], 0.9, torch.zeros(1, 3))]) is False
 
 
 def test_surface_particles_are_those_near_the_faces() -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import CapabilityError, InputError
-from cpdeform.core.placer import Placement, Stage
+from cpdeform.core.placer import Proposal, Stage
 from cpdeform.core.scene import BodyBox, ManipulatorCapsule, Scene
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
@@ -37,7 +37,7 @@ def board(count: int = 3000, dtype: torch.dtype = torch.float32, **tool: Any) ->
     return Stage(0, scene, state, state.position[0], priorities, torch.Generator().manual_seed(0))
 
 
-def distances(stage: Stage, placement: Placement) -> Tensor:
+def distances(stage: Stage, placement: Proposal) -> Tensor:
     return signed_distance(stage.scene.manipulators[0], placement.pose[0], stage.state.position[0])
 
 

@@ -75,7 +75,7 @@ def test_stages_follow_each_other_and_the_best_plan_is_executed(task):
     assert torch.equal(first.actions, first.candidates[0].actions)
     assert first.positions.shape == (6, 60, 3)
     assert torch.equal(first.positions[-1], first.state.position[0])
-    assert torch.equal(first.manipulator_poses[0], first.candidates[0].placement.pose)
+    assert torch.equal(first.manipulator_poses[0], first.candidates[0].proposal.pose)
     assert placer.told[0] == [candidate.loss for candidate in first.candidates]
     assert result.gradient_evaluations == 2 * 3 * 3
     assert set(first.seconds) == {"transport", "placement", "optimization", "execution", "total"}

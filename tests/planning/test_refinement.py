@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from cpdeform.planning.refinement import REFINEMENT, Refinement
 from cpdeform_toy.parts import OTSolverToy, PlacerToy
 from cpdeform_toy.simulator import SimulatorToy
 
@@ -16,7 +17,6 @@ from cpdeform.planning.objectives.density import ObjectiveDensity
 from cpdeform.planning.objectives.soft_iou import ObjectiveSoftIoU
 from cpdeform.planning.objectives.transport import ObjectiveTransport
 from cpdeform.planning.optimizer import TrajectoryOptimizer
-from cpdeform.planning.refinement import REFINEMENT, Refinement
 from cpdeform.run.configuration import RefinementConfiguration, RunConfiguration, with_task_settings
 from cpdeform.run.deform import deform, make_refinement
 
@@ -118,7 +118,7 @@ def test_refinement_by_transport_has_nothing_that_a_task_adds_for_the_search(tas
     plain = ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene)
     start = SimulatorToy(task.scene, batch_size=1)
     found = stage.candidates[stage.best]
-    world = stage.state_before.with_manipulators(found.placement.pose.unsqueeze(0))
+    world = stage.state_before.with_manipulators(found.proposal.pose.unsqueeze(0))
     final = float(plain.evaluate(start.rollout(world, stage.actions.unsqueeze(0))).loss[0])
     assert final == pytest.approx(min(refined), rel=1e-5)
     assert final < refined[0]

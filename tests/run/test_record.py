@@ -13,11 +13,11 @@ import h5py
 import pytest
 import torch
 
-from cpdeform.run import record_files
 from cpdeform.core.errors import InputError, RecordError
 from cpdeform.core.plugins import load_registry
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.result import Observer
+from cpdeform.run import record_files
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.deform import deform
 from cpdeform.run.record import RunRecorder, load_record, save_result
@@ -64,10 +64,10 @@ def test_what_is_saved_is_what_is_loaded(tmp_path, run):
             assert torch.equal(getattr(saved, field), getattr(loaded, field))
         assert torch.equal(saved.positions.float(), loaded.positions)
         for before, after in zip(saved.candidates, loaded.candidates, strict=True):
-            assert torch.equal(before.placement.pose, after.placement.pose)
+            assert torch.equal(before.proposal.pose, after.proposal.pose)
             assert torch.equal(before.actions, after.actions)
-            assert (before.loss, before.placement.label) == (after.loss, after.placement.label)
-            assert before.placement.contact_particle == after.placement.contact_particle
+            assert (before.loss, before.proposal.label) == (after.loss, after.proposal.label)
+            assert before.proposal.contact_particle == after.proposal.contact_particle
     lines = [(line["kind"], line["stage"], line.get("iteration")) for line in record.metrics]
     stage = [*(("iteration", 0, index) for index in range(3)), ("stage", 0, None)]
     assert lines == stage + [(kind, 1, number) for kind, _, number in stage]

@@ -6,7 +6,7 @@ import pytest
 import torch
 from kit import assert_caught
 
-from cpdeform.core.placer import Placement, Placer, PlacerCapabilities
+from cpdeform.core.placer import Placer, PlacerCapabilities, Proposal
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.testing import check_placer
@@ -42,7 +42,7 @@ class PlacerHover(Placer):
             bool((signed_distance(tool, pose[index], stage.state.position[0]) < 0).any())
             for index, tool in enumerate(stage.scene.manipulators)
         )
-        return [] if collides else [Placement(pose, float("nan"), "hover")]
+        return [] if collides else [Proposal(pose, float("nan"), "hover")]
 
 
 class PlacerNothing(PlacerHover):
@@ -55,14 +55,14 @@ class PlacerOneTool(PlacerHover):
         return super().pose(stage)[0]
 
     def ask(self, stage):
-        return [Placement(self.pose(stage), float("nan"), "flat")]
+        return [Proposal(self.pose(stage), float("nan"), "flat")]
 
 
 class PlacerColliding(PlacerHover):
     height = 0.1
 
     def ask(self, stage):
-        return [Placement(self.pose(stage), float("nan"), "inside")]
+        return [Proposal(self.pose(stage), float("nan"), "inside")]
 
 
 class PlacerOutside(PlacerHover):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import torch
@@ -18,11 +19,29 @@ COAST_SMOOTHING = 1e-5
 """Distance per step, length units, below which the coasting term is smooth instead of proportional."""
 
 
+@dataclasses.dataclass(frozen=True)
+class _Warm:
+    """What the next evaluation of a world can start from.
+
+    Attributes:
+        result: The solution of the last evaluation.
+        calls: Evaluations since the one from scratch that the chain began with.
+        cloud: Final positions (N, 3) of a solution from scratch; None of others.
+    """
+
+    result: OTResult
+    calls: int
+    cloud: Tensor | None = None
+
+    def is_of(self, cloud: Tensor) -> bool:
+        return self.cloud is not None and torch.equal(self.cloud, cloud)
+
+
 class ObjectiveTransport(Objective):
     """Transport cost of each world's final particles against the goal, optionally with PlasticineLab's contact term.
 
-    The gradient is the solver's own, placed at the last step. Within a stage every world starts from its previous
-    solution where the solver declares `warm_start`: particles move little between iterations of an optimiser.
+    The gradient is the solver's own, placed at the last step. Where the solver declares `warm_start`, a world's solution goes into
+    `ObjectiveResult.warm` and the next evaluation may start from it: particles move little between iterations of an optimiser.
 
     Args:
         solver: Solves the transport problems.
@@ -31,8 +50,9 @@ class ObjectiveTransport(Objective):
             of fewer particles is used whole. Clouds of equal size share the subset, so that particles that correspond stay
             together.
         seed: Seed of the subset.
-        warm_start: Whether to start from the previous call's solution, and the first call after `begin` from that of the start.
-        refresh: Solve from scratch on each `refresh`-th call, since errors of warm starts accumulate; never where absent.
+        warm_start: Whether to offer and to use warm starts.
+        refresh: Solve from scratch on each `refresh`-th call of a chain of warm starts, since their errors accumulate; None for
+            never.
         contact_weight: Weight of the hard contact term, summed over the steps t = 1..T, cost units/length^2. It attracts
             tools that do not touch the body yet, from which the transport cost alone has no gradient.
         coast_steps: Environment steps for which the particles are taken to go on as fast as in the last one. The loss then is the
@@ -79,47 +99,18 @@ class ObjectiveTransport(Objective):
         self.warm_start, self.refresh = warm_start and solver.capabilities.warm_start, refresh
         self.contact_weight, self.coast_steps, self.scene = contact_weight, coast_steps, scene
         self._scale = torch.tensor(axis_scale, dtype=torch.float64)
-        self._previous: list[OTResult] = []
-        self._start: OTResult | None = None
-        self._start_cloud: Tensor | None = None
-        self._calls = 0
 
-    def begin(self, start: Trajectory) -> ObjectiveResult:
-        """Evaluate a single world from scratch; its solution is where the first evaluation of each batch starts from.
-
-        Where the call before was about the same particles, as at the end of a stage and the beginning of the next, its solution is
-        taken again.
-        """
-        cloud = start.positions[0, -1].detach()
-        known = self._start_cloud is not None and torch.equal(cloud, self._start_cloud)
-        previous, self._start = self._start if known else None, None
-        self.reset()
-        result = self._evaluate(start, None if previous is None else [previous])
-        self._start, self._start_cloud = (self._previous[0], cloud.clone()) if self._previous else (None, None)
-        self.reset()
-        return result
-
-    def reset(self) -> None:
-        """Forget the solutions kept for warm starts, but that of the stage's start."""
-        self._previous = []
-        self._calls = 0
-
-    def keep(self, worlds: Sequence[int]) -> None:
-        """Forget the solutions of the worlds that were dropped."""
-        self._previous = [self._previous[world] for world in worlds] if self._previous else []
-
-    def evaluate(self, trajectory: Trajectory) -> ObjectiveResult:
+    def evaluate(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> ObjectiveResult:
         """Loss and gradient of each world of a trajectory.
 
-        Raises:
-            InputError: A final position is not finite.
-        """
-        return self._evaluate(trajectory, None)
+        Without `warm`, the transport problems are solved from scratch. An entry made that way serves as the start of any world
+        nearby; for the very same particles, as at the end of a stage and the beginning of the next, its solution is taken again.
 
-    def _evaluate(self, trajectory: Trajectory, solutions: list[OTResult] | None) -> ObjectiveResult:
-        """As `evaluate`, with the transport problems' solutions where they are known."""
+        Raises:
+            InputError: A final position is not finite, or `warm` is not what an earlier result held.
+        """
         positions = trajectory.positions.detach()
-        loss, gradient = self._transport(positions[:, -1], solutions)
+        loss, gradient, entries = self._transport(positions[:, -1], self._entries(warm, len(positions)))
         grad_positions = torch.zeros_like(positions)
         grad_positions[:, -1] = gradient
         if self.coast_steps > 0.0:
@@ -132,7 +123,16 @@ class ObjectiveTransport(Objective):
             contact, contact_positions, grad_poses = self._contact(self.scene, positions, trajectory.manipulator_poses.detach())
             loss = loss + contact
             grad_positions += contact_positions
-        return ObjectiveResult(loss=loss, grad_positions=grad_positions, grad_manipulators=grad_poses)
+        return ObjectiveResult(loss, grad_positions, grad_poses, warm=entries if self.warm_start else None)
+
+    def _entries(self, warm: Sequence[object] | None, worlds: int) -> list[_Warm] | None:
+        """The warm entries, checked; None for a start from scratch."""
+        if warm is None or not self.warm_start:
+            return None
+        entries = [entry for entry in warm if isinstance(entry, _Warm)]
+        if len(entries) != worlds or len(warm) != worlds:
+            raise InputError("warm", came=f"{len(warm)} entries", expected=f"{worlds} of an earlier result of this objective")
+        return entries
 
     def _coast(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Mean distance (B,) that particles would still go, and its gradient (B, N, 3) at the last step.
@@ -144,29 +144,32 @@ class ObjectiveTransport(Objective):
         scale = self.coast_steps / positions.shape[2]
         return scale * (length - COAST_SMOOTHING).sum(dim=-1), scale * step / length.unsqueeze(-1)
 
-    def _transport(self, final: Tensor, solutions: list[OTResult] | None) -> tuple[Tensor, Tensor]:
-        """Cost (B,) and gradient (B, N, 3) of final positions (B, N, 3)."""
+    def _transport(self, final: Tensor, warm: list[_Warm] | None) -> tuple[Tensor, Tensor, tuple[_Warm, ...]]:
+        """Cost (B,) and gradient (B, N, 3) of final positions (B, N, 3), and what the next evaluation can start from."""
         source_index, target_index = (index.to(final.device) for index in self._subsets(final.shape[1]))
         scale = self._scale.to(final)
         clouds, target = scale * final[:, source_index], scale * self.target.to(final)[target_index]
-        results = self._solve(clouds, target) if solutions is None else solutions
-        self._previous = results if self.warm_start else []
-        self._calls += 1
+        known = [entry.result for entry, cloud in zip(warm, final, strict=True) if entry.is_of(cloud)] if warm else []
+        if warm is not None and len(known) == len(final):
+            results, entries = known, tuple(warm)
+        else:
+            results, entries = self._solve(clouds, target, final, warm)
         gradient = torch.zeros_like(final)
         for world, result in enumerate(results):
             gradient[world, source_index] = scale * result.source_gradient.to(final)
-        return torch.stack([result.value.to(final) for result in results]), gradient
+        return torch.stack([result.value.to(final) for result in results]), gradient, entries
 
-    def _solve(self, clouds: Tensor, target: Tensor) -> list[OTResult]:
+    def _solve(
+        self, clouds: Tensor, target: Tensor, final: Tensor, warm: list[_Warm] | None
+    ) -> tuple[list[OTResult], tuple[_Warm, ...]]:
         """Solutions of clouds (B, n, 3) against the target (m, 3), warm-started where that may be."""
-        cold = self.refresh is not None and self._calls > 0 and self._calls % self.refresh == 0
-        previous: list[OTResult | None] = [None] * len(clouds)
-        # A call with another number of worlds is another batch of plans: which world was which is unknown.
-        if self.warm_start and not cold and len(self._previous) == len(clouds):
-            previous = list(self._previous)
-        elif self.warm_start and self._calls == 0:
-            previous = [self._start] * len(clouds)
-        return [self.solver.solve(cloud, target, previous=start) for cloud, start in zip(clouds, previous, strict=True)]
+        if warm is None:
+            results = self.solver.solve_batch(clouds, target)
+            return results, tuple(_Warm(result, 0, cloud.clone()) for result, cloud in zip(results, final, strict=True))
+        due = [self.refresh is not None and entry.calls > 0 and entry.calls % self.refresh == 0 for entry in warm]
+        previous = [None if cold else entry.result for cold, entry in zip(due, warm, strict=True)]
+        results = self.solver.solve_batch(clouds, target, previous=previous)
+        return results, tuple(_Warm(result, entry.calls + 1) for result, entry in zip(results, warm, strict=True))
 
     def _subsets(self, source_count: int) -> tuple[Tensor, Tensor]:
         """Sorted indices of the source and the target particles that the problem is solved on."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from cpdeform.core.ot import OTCapabilities, OTResult, OTSolver, check_problem, fix_gauge
-from cpdeform.core.placer import Placement, Placer, PlacerCapabilities
+from cpdeform.core.placer import Placer, PlacerCapabilities, Proposal
 
 
 class OTSolverToy(OTSolver):
@@ -47,14 +47,14 @@ class PlacerToy(Placer):
         self.count, self.spacing, self.rounds = count, spacing, rounds
         self.told: list[list[float]] = []
 
-    def ask(self, stage) -> list[Placement]:
+    def ask(self, stage) -> list[Proposal]:
         assert torch.isfinite(stage.priorities).all()
         particle = int(stage.priorities.argmax())
         placements = []
         for index in range(self.count):
             pose = stage.state.manipulator_pose[0].clone()
             pose[0, 0] += self.spacing * (index + 1)
-            placements.append(Placement(pose, float(stage.priorities.max()), f"candidate-{index}", particle))
+            placements.append(Proposal(pose, float(stage.priorities.max()), f"candidate-{index}", particle))
         return placements
 
     def tell(self, results) -> bool:
@@ -67,5 +67,5 @@ class PlacerFixedToy(PlacerToy):
 
     capabilities = PlacerCapabilities(needs_priorities=False, max_manipulators=None)
 
-    def ask(self, stage) -> list[Placement]:
-        return [Placement(stage.state.manipulator_pose[0], float("nan"), "fixed")]
+    def ask(self, stage) -> list[Proposal]:
+        return [Proposal(stage.state.manipulator_pose[0], float("nan"), "fixed")]

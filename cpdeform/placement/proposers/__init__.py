@@ -1,0 +1,1 @@
+"""Proposers: the ways of taking hold of a body, one file each."""

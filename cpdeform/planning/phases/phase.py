@@ -1,0 +1,49 @@
+"""The interface of phases."""
+
+from __future__ import annotations
+
+import abc
+from typing import ClassVar, Literal
+
+from cpdeform.core.placer import Candidate
+from cpdeform.planning.workbench import Workbench
+
+
+class Phase(abc.ABC):
+    """A step from proposals to the plan of a stage.
+
+    A stage runs a list of phases. Those of the scope ``"round"`` work, one after the other, on all candidates of each round of
+    proposals. Those of the scope ``"stage"`` then work on the plan of the lowest loss, and what they find is executed in its place
+    where they accept it. To add a phase, write a subclass and put it into the list: `cpdeform.planning.strategy.Strategy.phases`.
+
+    Attributes:
+        name: Short name, told to observers with each iteration, and the key of its wall time.
+        scope: ``"round"`` or ``"stage"``.
+    """
+
+    name: str
+    scope: ClassVar[Literal["round", "stage"]]
+
+    @abc.abstractmethod
+    def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
+        """Work on candidates.
+
+        Args:
+            bench: The stage, the simulator and the counters.
+            candidates: Candidates of a round, fresh (`bench.first_actions` gives them actions) or as the phase before left them;
+                of the scope ``"stage"`` the single one that was executed.
+
+        Returns:
+            Of a round, the same candidates in the same order, with plans and losses; infinite losses mark those that the next
+            phases leave out. Of a stage, the changed candidate, or nothing where nothing was gained.
+        """
+
+    def accepts(self, loss: float, *, loss_before: float, loss_now: float) -> bool:
+        """Whether a plan that was executed counts.
+
+        Args:
+            loss: Its loss, from a fresh evaluation of the stage's objective.
+            loss_before: Loss of leaving the stage's state as it is.
+            loss_now: Loss of the plan that it would replace; `loss_before` where there is none.
+        """
+        return loss < loss_before

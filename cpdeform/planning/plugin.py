@@ -1,0 +1,27 @@
+"""Registers the built-in strategies."""
+
+from __future__ import annotations
+
+from cpdeform.core.hookspecs import PluginSpec, hookimpl
+
+
+@hookimpl
+def cpdeform_strategies() -> list[PluginSpec]:
+    """The default, the paper's algorithm, and a search that looks ahead."""
+    return [
+        PluginSpec(
+            name="cpdeform",
+            target="cpdeform.planning.strategies.cpdeform:StrategyCpdeform",
+            summary="contact points discovery, candidates race each other (the default)",
+        ),
+        PluginSpec(
+            name="paper",
+            target="cpdeform.planning.strategies.paper:StrategyPaper",
+            summary="Algorithm 1 of the paper to the letter",
+        ),
+        PluginSpec(
+            name="look-ahead",
+            target="cpdeform.planning.strategies.look_ahead:StrategyLookAhead",
+            summary="a beam over stages: several states go on, the best path is kept",
+        ),
+    ]

@@ -1,0 +1,74 @@
+"""The interface of strategies: which contacts are proposed, in which phases, by which losses, with which budget."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
+
+from cpdeform.core.objective import Objective
+from cpdeform.core.placer import Placer
+from cpdeform.core.task import Task
+from cpdeform.planning.algorithm import Planner, Start, contact_points_discovery
+from cpdeform.planning.optimizer import TrajectoryOptimizer
+from cpdeform.planning.phases.descent import PhaseDescent, PhaseRefinement
+from cpdeform.planning.phases.phase import Phase
+from cpdeform.planning.result import StageResult
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Parts:
+    """What the configuration of a run makes, for a strategy to put together.
+
+    Attributes:
+        task: What is to be done.
+        placer: Turns priorities into proposals.
+        objective: The shape loss.
+        optimizer: Finds actions.
+        refinement: Loss and optimiser of the refinement that the configuration asks for; None for none.
+    """
+
+    task: Task
+    placer: Placer
+    objective: Objective
+    optimizer: TrajectoryOptimizer
+    refinement: tuple[Objective, TrajectoryOptimizer] | None = None
+
+
+class Strategy(abc.ABC):
+    """How the stages of a run find their plans.
+
+    A strategy answers three questions: what a run is configured with where the user says nothing (`settings`), which phases lead
+    from proposals to a stage's plan (`phases`), and how one stage follows the other (`loop`). Its constructor takes keyword options
+    (`strategy_options` of the configuration). Register a subclass with the hook `cpdeform_strategies`.
+
+    Attributes:
+        keeps_limits: Whether plans keep to the limits that a task puts on its tools (`Task.limits`).
+    """
+
+    keeps_limits: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
+        """Values of the configuration where the user sets nothing.
+
+        Args:
+            task: What is to be done.
+            placer: Name of the placer that the user asks for; None leaves it to the strategy.
+
+        Returns:
+            Fields of `cpdeform.run.configuration.RunConfiguration`, nested.
+        """
+
+    def phases(self, parts: Parts) -> tuple[Phase, ...]:
+        """The steps of a stage; defaults to a descent of all candidates, and a refinement where the configuration asks for one."""
+        search: tuple[Phase, ...] = (PhaseDescent(optimizer=parts.optimizer),)
+        if parts.refinement is None:
+            return search
+        objective, optimizer = parts.refinement
+        return (*search, PhaseRefinement(objective=objective, optimizer=optimizer))
+
+    def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
+        """Lead from stage to stage; defaults to the loop of Algorithm 1."""
+        return contact_points_discovery(planner, start)

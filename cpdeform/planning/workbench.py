@@ -1,0 +1,174 @@
+"""What the phases of a stage work with: the stage, the simulator, and counters of what was spent."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from cpdeform.core.objective import Objective
+from cpdeform.core.placer import Candidate, Stage
+from cpdeform.core.simulator import Simulator, Trajectory
+from cpdeform.core.state import State
+from cpdeform.core.task import Task
+from cpdeform.planning.batches import Evaluator, evaluate_worlds
+from cpdeform.planning.executor import Executor, ExecutorSerial
+from cpdeform.planning.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
+
+
+@dataclasses.dataclass(kw_only=True)
+class Workbench:
+    """A stage in the making. Phases compute through it, so that nothing is spent without being counted.
+
+    Attributes:
+        stage: State, goal, transport and random numbers.
+        task: Numbers of steps and of steps of rest.
+        simulator: Physics.
+        objective: The stage's loss, by which plans are chosen and executed.
+        warm: What the objective can start from, found where the stage begins; every world of the stage begins near there.
+        executor: Where batches are computed.
+        on_iteration: Told of each iteration of a descent.
+        on_batch: Told of the worlds of a batch and the memory that they need, bytes, before it is computed.
+        gradient_evaluations: Gradients computed so far, of all worlds together.
+        rollouts: Rollouts without a gradient so far.
+        history: Every iteration so far, in order.
+        seconds: Wall time by part.
+    """
+
+    stage: Stage
+    task: Task
+    simulator: Simulator
+    objective: Objective
+    warm: tuple[object, ...] | None = None
+    executor: Executor = dataclasses.field(default_factory=ExecutorSerial)
+    on_iteration: Callable[[Iteration], None] = lambda iteration: None
+    on_batch: Callable[[int, int], None] = lambda worlds, memory: None
+    gradient_evaluations: int = 0
+    rollouts: int = 0
+    history: list[Iteration] = dataclasses.field(default_factory=list)
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._start = self._mark = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        """Add the wall time since the last lap to a part."""
+        now = time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._mark
+        self._mark = now
+
+    def total(self) -> float:
+        """Wall time since the stage began, seconds."""
+        return time.perf_counter() - self._start
+
+    def first_actions(self, candidates: Sequence[Candidate], optimizer: TrajectoryOptimizer) -> list[Candidate]:
+        """Give candidates without actions their first ones: the proposal's, or the optimiser's small noise.
+
+        All are drawn at once, so that the result does not depend on how many worlds fit into a batch.
+
+        Args:
+            candidates: Candidates; those that have actions stay as they are.
+            optimizer: Draws them.
+        """
+        fresh = [number for number, candidate in enumerate(candidates) if not candidate.actions.numel()]
+        shape = (len(fresh), self.task.step_count, self.task.scene.action_size)
+        if any(candidates[number].proposal.actions is None for number in fresh):
+            drawn = optimizer.initial_actions(shape, self.stage.generator)
+        else:
+            drawn = torch.zeros(shape)
+        result = list(candidates)
+        for number, noise in zip(fresh, drawn, strict=True):
+            own = candidates[number].proposal.actions
+            padded = torch.nn.functional.pad(noise if own is None else own, (0, 0, 0, self.task.rest_steps))
+            result[number] = dataclasses.replace(candidates[number], actions=padded)
+        return result
+
+    def worlds(self, candidates: Sequence[Candidate]) -> State:
+        """The stage's state in a world for each candidate, tools placed."""
+        poses = torch.stack([candidate.proposal.pose for candidate in candidates])
+        return self.stage.state.fork(len(candidates)).with_manipulators(poses)
+
+    def minimize(
+        self, candidates: Sequence[Candidate], optimizer: TrajectoryOptimizer, objective: Objective | None, *, phase: str
+    ) -> OptimizationResult:
+        """Minimise an objective over the actions of candidates, count what it took, and tell of each iteration.
+
+        Args:
+            candidates: Candidates with actions.
+            optimizer: How.
+            objective: The loss; None for the stage's own.
+            phase: Name of the phase that asks.
+        """
+        history: list[Iteration] = []
+
+        def note(iteration: Iteration) -> None:
+            history.append(dataclasses.replace(iteration, phase=phase))
+            self.on_iteration(history[-1])
+
+        self._announce(len(candidates))
+        found = optimizer.minimize(
+            self.simulator,
+            self.worlds(candidates),
+            torch.stack([candidate.actions for candidate in candidates]),
+            self.objective if objective is None else objective,
+            rest_steps=self.task.rest_steps,
+            warm=self._warm(objective, len(candidates)),
+            executor=self.executor,
+            on_iteration=note,
+        )
+        self.gradient_evaluations += found.gradient_evaluations
+        self.history += history
+        return dataclasses.replace(found, history=tuple(history))
+
+    def rollout_losses(self, candidates: Sequence[Candidate], objective: Objective | None, *, phase: str) -> Tensor:
+        """Losses (B,) of the candidates' actions by rollouts without gradients; nan where one is not finite.
+
+        Args:
+            candidates: Candidates with actions.
+            objective: The loss; None for the stage's own.
+            phase: Name of the phase that asks.
+        """
+        self._announce(len(candidates))
+        losses = []
+        evaluator = Evaluator(self.simulator, self.objective if objective is None else objective, with_gradient=False)
+        # Piece by piece: the states of hundreds of worlds need not be there at once.
+        for start in range(0, len(candidates), self.simulator.batch_size):
+            part = candidates[start : start + self.simulator.batch_size]
+            state = self.worlds(part)
+            found = evaluate_worlds(
+                evaluator,
+                self.executor,
+                state,
+                torch.stack([candidate.actions for candidate in part]).to(state.position),
+                warm=self._warm(objective, len(part)) or [None] * len(part),
+                stand_ins=state.position,
+            )
+            losses.append(found.loss)
+        self.rollouts += len(candidates)
+        return torch.cat(losses)
+
+    def execute(self, candidate: Candidate) -> tuple[Trajectory, float, tuple[object, ...] | None]:
+        """Run a plan once more, as a single world, and take its loss by a fresh (not warm-started) evaluation.
+
+        Returns:
+            The trajectory, its loss (nan where the rollout is not finite), and what the objective can start from at its end.
+        """
+        start = self.stage.state.with_manipulators(candidate.proposal.pose.unsqueeze(0))
+        trajectory = self.simulator.rollout(start, candidate.actions.unsqueeze(0).to(start.position))
+        self.rollouts += 1
+        if not bool(torch.isfinite(trajectory.positions).all()):
+            return trajectory, float("nan"), None
+        result = self.objective.evaluate(trajectory)
+        return trajectory, float(result.loss[0]), result.warm
+
+    def _warm(self, objective: Objective | None, worlds: int) -> list[object] | None:
+        """The warm start of the stage's own objective, for every world."""
+        own = objective is None or objective is self.objective
+        return [self.warm[0]] * worlds if own and self.warm else None
+
+    def _announce(self, worlds: int) -> None:
+        room = min(worlds, self.simulator.batch_size)
+        self.on_batch(room, self.simulator.memory_estimate(self.task.rollout_steps, worlds=room))

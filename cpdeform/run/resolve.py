@@ -1,0 +1,270 @@
+"""The one resolver: from names, files and objects to a run that is ready to start.
+
+Python (`cpdeform.deform`), the command line and the experiments all come through `resolve`, so that the same request is the same
+run everywhere.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from cpdeform.core.errors import InputError
+from cpdeform.core.objective import Objective
+from cpdeform.core.ot import OTSolver
+from cpdeform.core.placer import Placer
+from cpdeform.core.plugins import AUTO, Registry
+from cpdeform.core.simulator import Simulator
+from cpdeform.core.state import State
+from cpdeform.core.task import Task, changed_task, limited_task, load_task, merge, validate
+from cpdeform.planning.algorithm import Planner
+from cpdeform.planning.optimizer import TrajectoryOptimizer
+from cpdeform.planning.result import Observer, StageResult
+from cpdeform.planning.strategy import Parts, Strategy
+from cpdeform.run.configuration import RunConfiguration
+from cpdeform.run.hook_observer import HookObserver
+from cpdeform.run.parts import (
+    make_objective,
+    make_optimizer,
+    make_priorities_solver,
+    make_refinement,
+    transport_problem,
+)
+from cpdeform.run.record_reader import RunRecord
+from cpdeform.run.result import RunResult
+from cpdeform.run.resume import check_same_task, resumed_task, resumed_values
+
+MAX_WORLDS = 16
+"""Worlds that a simulator given by name holds at once; more candidates are computed in several batches."""
+
+OWN_FIELDS: Mapping[str, str] = {"scene": "scene.<field>", "device": "device"}
+"""Options of simulators that the configuration sets itself, and where."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PartObjects:
+    """Parts given as objects; None for those that the configuration names.
+
+    Attributes:
+        simulator: A simulator of the task's scene.
+        ot_solver: Solves the placer's transport problem and, without `objective`, the loss's.
+        placer: Proposes placements.
+        strategy: Leads the search.
+        objective: The loss. No refinement comes after it: it is what the user wants lowered.
+        optimizer: Finds actions.
+    """
+
+    simulator: Simulator | None = None
+    ot_solver: OTSolver | None = None
+    placer: Placer | None = None
+    strategy: Strategy | None = None
+    objective: Objective | None = None
+    optimizer: TrajectoryOptimizer | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ResolvedRun:
+    """A run that is ready to start: nothing in it is left open.
+
+    Attributes:
+        configuration: All names and values, those of the strategy included.
+        task: The task with all changes and limits in its scene.
+        strategy: Leads the search.
+        registry: Where names are looked up.
+        objects: Parts given as objects.
+        record: The record that the run goes on from; None for a run from the task's start.
+        state: Where to start, a single world; None for the scene's start.
+        first_stage: Number of the first stage.
+        previous: The stages before it.
+    """
+
+    configuration: RunConfiguration
+    task: Task
+    strategy: Strategy
+    registry: Registry
+    objects: PartObjects = PartObjects()
+    record: RunRecord | None = None
+    state: State | None = None
+    first_stage: int = 0
+    previous: tuple[StageResult, ...] = ()
+
+    @property
+    def names(self) -> dict[str, str]:
+        """Names or classes of the parts."""
+        given = {
+            "backend": self.objects.simulator,
+            "ot": self.objects.ot_solver,
+            "placer": self.objects.placer,
+            "strategy": self.objects.strategy,
+        }
+        return {kind: getattr(self.configuration, kind) if part is None else type(part).__name__ for kind, part in given.items()}
+
+    def planner(self, observers: Sequence[Observer] = ()) -> Planner:
+        """Make the parts and put them together.
+
+        Args:
+            observers: Told of every iteration and stage, in order; the plugins' observers come after them.
+
+        Raises:
+            InputError: An option does not fit.
+            MissingExtraError: A part's optional dependency is not installed.
+        """
+        configuration, registry, objects, task = self.configuration, self.registry, self.objects, self.task
+        placer = objects.placer or registry.create("placer", configuration.placer, **configuration.placer_options)
+        simulator = objects.simulator or registry.create(
+            "simulator",
+            configuration.backend,
+            scene=task.scene,
+            device=configuration.device,
+            **{"batch_size": MAX_WORLDS, **configuration.simulator_options},
+        )
+        optimizer = objects.optimizer or make_optimizer(configuration.optimizer)
+        problem = transport_problem(placer, configuration.priorities)
+        loss_solver = objects.ot_solver or configuration.ot
+        objective, refinement = objects.objective, None
+        if objective is None:
+            objective = make_objective(task, loss_solver, simulator, options=configuration.objective, registry=registry)
+            refinement = make_refinement(
+                task,
+                loss_solver,
+                simulator,
+                options=configuration.refinement,
+                blur=configuration.objective.blur,
+                most=optimizer.iterations,
+                registry=registry,
+            )
+        parts = Parts(task=task, placer=placer, objective=objective, optimizer=optimizer, refinement=refinement)
+        return Planner(
+            task=task,
+            simulator=simulator,
+            ot_solver=objects.ot_solver or make_priorities_solver(problem, configuration, registry=registry),
+            problem=problem,
+            placer=placer,
+            objective=objective,
+            phases=self.strategy.phases(parts),
+            loop=self.strategy.loop,
+            seed=configuration.seed,
+            observers=(*observers, HookObserver(registry.manager)),
+            names=self.names,
+        )
+
+    def run(self, observers: Sequence[Observer] = ()) -> RunResult:
+        """Run it; as `cpdeform.deform`.
+
+        Args:
+            observers: Told of every iteration and stage, in order; the plugins' observers come after them.
+        """
+        found = self.planner(observers).run(
+            stages=self.configuration.stages, state=self.state, first_stage=self.first_stage, previous=self.previous
+        )
+        fields = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
+        return RunResult(**fields, configuration=self.configuration, resumed_from=self.record)
+
+
+def resolve(
+    given: RunConfiguration | Mapping[str, Any],
+    *,
+    registry: Registry,
+    task: Task | None = None,
+    record: RunRecord | None = None,
+    objects: PartObjects | None = None,
+    state: State | None = None,
+    first_stage: int = 0,
+) -> ResolvedRun:
+    """Resolve everything that a run needs.
+
+    What the user gives overrides what the record says, that overrides what the strategy sets, and that the defaults. The task's
+    scene has its limits in force, unless the strategy takes the scene as it is, and then the user's changes.
+
+    Args:
+        given: What the user set: fields of `RunConfiguration`, nested, or one whose unset fields do not count.
+        registry: Where names are looked up.
+        task: The task as an object, instead of the configuration's name.
+        record: The record to go on from: its last state, its task and configuration.
+        objects: Parts given as objects.
+        state: Where to start, a single world, without a record.
+        first_stage: Number of the first stage, without a record.
+
+    Raises:
+        InputError: A name, an option, the task or the record cannot be used.
+        PluginError: Nothing is installed that ``"auto"`` could stand for.
+    """
+    objects = objects or PartObjects()
+    values = given.model_dump(exclude_unset=True) if isinstance(given, RunConfiguration) else dict(given)
+    asked = validate(RunConfiguration, values, source="configuration")
+    _check_names(asked, objects, registry=registry)
+    if record is not None:
+        if task is not None or "task" in values:
+            check_same_task(record, task if task is not None else load_task(asked.task, registry=registry))
+        values = resumed_values(record, values)
+        asked = validate(RunConfiguration, values, source="configuration")
+        _check_names(asked, objects, registry=registry)
+    strategy = objects.strategy or registry.create("strategy", asked.strategy, **asked.strategy_options)
+    if record is None:
+        task = task if task is not None else load_task(asked.task, registry=registry)
+        task = _changed(_with_limits(task, strategy, objects), asked)
+    else:
+        task = changed_task(resumed_task(record), scene=asked.scene)
+    settings = strategy.settings(task, placer=values.get("placer"))
+    configuration = validate(RunConfiguration, merge(settings, values), source=f"strategy {asked.strategy}: settings")
+    device = configuration.device
+    configuration = configuration.model_copy(
+        update={
+            "task": configuration.task if configuration.task.endswith((".yaml", ".yml")) else task.name,
+            "backend": registry.resolve("simulator", configuration.backend, device=device)
+            if objects.simulator is None
+            else configuration.backend,
+            "ot": registry.resolve("ot_solver", configuration.ot, device=device) if objects.ot_solver is None else configuration.ot,
+        }
+    )
+    return ResolvedRun(
+        configuration=configuration,
+        task=task,
+        strategy=strategy,
+        registry=registry,
+        objects=objects,
+        record=record,
+        state=state if record is None else record.state,
+        first_stage=first_stage if record is None else record.next_stage,
+        previous=() if record is None else record.stages,
+    )
+
+
+def _check_names(configuration: RunConfiguration, objects: PartObjects, *, registry: Registry) -> None:
+    """Hold names and option groups against the registry, before anything slow is imported."""
+    named = (
+        ("simulator", configuration.backend, objects.simulator),
+        ("ot_solver", configuration.ot, objects.ot_solver),
+        ("placer", configuration.placer, objects.placer),
+        ("strategy", configuration.strategy, objects.strategy),
+    )
+    for kind, name, part in named:
+        if part is None and name != AUTO:
+            registry.find(kind, name)
+    for option, place in OWN_FIELDS.items():
+        if option in configuration.simulator_options:
+            remedy = f"Set {place} instead."
+            raise InputError("simulator_options", came=f'"{option}"', expected="other options", remedy=remedy)
+
+
+def _with_limits(task: Task, strategy: Strategy, objects: PartObjects) -> Task:
+    """The task with its limits in force or, where the scene is taken as it is, left away."""
+    without = task.model_copy(update={"limits": {}})
+    if not strategy.keeps_limits:
+        return without
+    limited = limited_task(task)
+    # A simulator given as an object has a scene already.
+    if objects.simulator is not None and objects.simulator.scene != limited.scene:
+        return without
+    return limited
+
+
+def _changed(task: Task, configuration: RunConfiguration) -> Task:
+    return changed_task(
+        task,
+        scene=configuration.scene,
+        target=configuration.target,
+        step_count=configuration.steps,
+        rest_steps=configuration.rest_steps,
+    )
