@@ -32,7 +32,8 @@ def toy_distribution(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def toy_entry_points() -> list[importlib.metadata.EntryPoint]:
-    return [importlib.metadata.EntryPoint("toy", "cpdeform_toy.plugin", "cpdeform")]
+    modules = {"toy": "cpdeform_toy.plugin", "strategies": "cpdeform.planning.plugin"}
+    return [importlib.metadata.EntryPoint(name, module, "cpdeform") for name, module in modules.items()]
 
 
 def write_toy_task(directory: Path, *, offset: float = 0.1, **fields: object) -> Path:

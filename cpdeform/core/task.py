@@ -209,6 +209,13 @@ def read_task(path: Path, *, variant: str | None = None) -> Task:
         UnknownNameError: There is no such variant.
     """
     content = _read_mapping(path)
+    if "settings" in content:
+        raise InputError(
+            f"task file {path}: settings",
+            came="settings of a run",
+            expected="scene, goal and schedule alone",
+            remedy="Give them with --set or in a strategy; limits of the tools go under `limits`.",
+        )
     variants = content.pop("variants", None) or {}
     if not isinstance(variants, dict):
         raise InputError(f"task file {path}: variants", came=type(variants).__name__, expected="a mapping of names to changes")

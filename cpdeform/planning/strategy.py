@@ -40,8 +40,9 @@ class Strategy(abc.ABC):
     """How the stages of a run find their plans.
 
     A strategy answers three questions: what a run is configured with where the user says nothing (`settings`), which phases lead
-    from proposals to a stage's plan (`phases`), and how one stage follows the other (`loop`). Its constructor takes keyword options
-    (`strategy_options` of the configuration). Register a subclass with the hook `cpdeform_strategies`.
+    from proposals to a stage's plan (`phases`), and how one stage follows the other (`loop`). It may bring a placer of its own.
+    Its constructor takes keyword options (`strategy_options` of the configuration). Register a subclass with the hook
+    `cpdeform_strategies`.
 
     Attributes:
         keeps_limits: Whether plans keep to the limits that a task puts on its tools (`Task.limits`).
@@ -60,6 +61,15 @@ class Strategy(abc.ABC):
         Returns:
             Fields of `cpdeform.run.configuration.RunConfiguration`, nested.
         """
+
+    def placer(self, named: Placer, *, task: Task) -> Placer:
+        """The placer of the run; defaults to the one that the configuration names.
+
+        Args:
+            named: That one.
+            task: What is to be done.
+        """
+        return named
 
     def phases(self, parts: Parts) -> tuple[Phase, ...]:
         """The steps of a stage; defaults to a descent of all candidates, and a refinement where the configuration asks for one."""

@@ -111,7 +111,10 @@ class ResolvedRun:
             MissingExtraError: A part's optional dependency is not installed.
         """
         configuration, registry, objects, task = self.configuration, self.registry, self.objects, self.task
-        placer = objects.placer or registry.create("placer", configuration.placer, **configuration.placer_options)
+        placer = objects.placer
+        if placer is None:
+            named = registry.create("placer", configuration.placer, **configuration.placer_options)
+            placer = self.strategy.placer(named, task=task)
         simulator = objects.simulator or registry.create(
             "simulator",
             configuration.backend,
@@ -193,13 +196,12 @@ def resolve(
     objects = objects or PartObjects()
     values = given.model_dump(exclude_unset=True) if isinstance(given, RunConfiguration) else dict(given)
     asked = validate(RunConfiguration, values, source="configuration")
-    _check_names(asked, objects, registry=registry)
     if record is not None:
         if task is not None or "task" in values:
             check_same_task(record, task if task is not None else load_task(asked.task, registry=registry))
         values = resumed_values(record, values)
         asked = validate(RunConfiguration, values, source="configuration")
-        _check_names(asked, objects, registry=registry)
+    _check_names(asked, objects, registry=registry)
     strategy = objects.strategy or registry.create("strategy", asked.strategy, **asked.strategy_options)
     if record is None:
         task = task if task is not None else load_task(asked.task, registry=registry)

@@ -202,7 +202,8 @@ def check_impossible(bench: PlacerBench) -> Finding:
 
 def check_priorities(bench: PlacerBench) -> Finding:
     """Without declared need, priorities of nan change nothing; with it, they are refused or placed nowhere."""
-    stage = reseeded(bench.stage, priorities=torch.full_like(bench.stage.priorities, math.nan))
+    nothing = torch.full_like(bench.stage.priorities, math.nan)
+    stage = reseeded(bench.stage, transport=transport_of(nothing))
     if not bench.make().capabilities.needs_priorities:
         return Finding(_difference(bench.placements, bench.make().ask(stage)), 0.0)
     try:

@@ -66,7 +66,7 @@ def no_runs(monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("a run was made")
 
-    monkeypatch.setattr("cpdeform.experiments.experiment.deform_configuration", refuse)
+    monkeypatch.setattr("cpdeform.run.resolve.ResolvedRun.run", refuse)
 
 
 def test_rows_and_records(made):

@@ -20,7 +20,7 @@ def test_tools_stay_even_in_collision() -> None:
         manipulators=tuple(ManipulatorSphere(position=(x, 0.4, 0.5), radius=0.05, action_scale=(1.0,) * 3) for x in (0.4, 0.6)),
     )
     state = initial_state(scene)
-    stage = Stage(0, scene, state, state.position[0], torch.full((50,), torch.nan), torch.Generator())
+    stage = Stage(0, scene, state, state.position[0], None, torch.Generator())
     (placement,) = PlacerFixed().ask(stage)
     assert torch.equal(placement.pose, state.manipulator_pose[0])
     assert placement.pose.data_ptr() != state.manipulator_pose.data_ptr()

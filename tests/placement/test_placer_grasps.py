@@ -19,6 +19,7 @@ from cpdeform.placement.pose import GRASP_DIRECTIONS, turned
 from cpdeform.placement.random import PlacerRandom
 from cpdeform.placement.touch import exit_distances
 from cpdeform.placement.transport import PlacerTransport
+from cpdeform.testing.placer import transport_of
 
 IDENTITY = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 SCALE = (0.01, 0.01, 0.01)
@@ -32,7 +33,7 @@ def make_stage(bodies: list[dict[str, Any]], tools: list[ManipulatorBase], peak:
     distance = (state.position[0] - torch.tensor(peak).to(state.position)).norm(dim=1)
     priorities = 0.03 * torch.exp(-((distance / 0.05) ** 2))
     generator = torch.Generator().manual_seed(0)
-    return Stage(0, scene, state, state.position[0], priorities - priorities.median(), generator, loss=1.0)
+    return Stage(0, scene, state, state.position[0], transport_of(priorities - priorities.median()), generator, loss=1.0)
 
 
 def block(**changes: Any) -> dict[str, Any]:
@@ -93,7 +94,7 @@ def test_a_contact_point_beyond_the_bounds_is_faced_from_as_near_as_they_allow()
 
 def test_first_tool_takes_the_better_side() -> None:
     stage = make_stage([block(widths=(0.2, 0.1, 0.1))], plates(), (0.6, 0.4, 0.5))
-    (placement,) = PlacerTransport(poses=["left-right"]).ask(stage)
+    (placement,) = PlacerTransport(proposers=["left-right"]).ask(stage)
     assert placement.pose[0, 0] > 0.6 > 0.4 > placement.pose[1, 0]
 
 
@@ -105,7 +106,7 @@ def test_the_body_with_the_highest_mean_priority_comes_first() -> None:
     high = 0.001 + torch.zeros_like(stage.priorities)
     high[2000:] = 0.01
     high[5] = 0.02  # a single particle, the largest of all, in the body whose mean is low
-    object.__setattr__(stage, "priorities", high)
+    stage = dataclasses.replace(stage, transport=transport_of(high))
     placer = PlacerTransport()
     placements = placer.ask(stage)
     assert all(placement.contact_particle is not None and placement.contact_particle >= 2000 for placement in placements)
@@ -130,7 +131,7 @@ def test_pairs_share_out_the_bodies() -> None:
 
 def test_explored_particles_are_not_proposed_again() -> None:
     stage = make_stage([block()], plates(), (0.55, 0.42, 0.45))
-    placer, contacts = PlacerTransport(attempts=3), []
+    placer, contacts = PlacerTransport(rounds=3), []
     for attempt in range(3):
         placements = placer.ask(stage)
         contacts.append(placements[0].contact_particle)
@@ -148,9 +149,9 @@ def test_explored_particles_are_not_proposed_again() -> None:
 def test_a_contact_point_out_of_reach_is_passed_over() -> None:
     tools = [ManipulatorSphere(radius=0.03, position=(0.5, 0.6, 0.5), action_scale=SCALE, lower_bound=(0.0, 0.4, 0.0))]
     stage = make_stage([block()], tools, (0.5, 0.35, 0.5))
-    (placement,) = PlacerTransport(attempts=1).ask(stage)
+    (placement,) = PlacerTransport(rounds=1).ask(stage)
     # nor do tools that stay where they are stand in for it
-    labels = [item.label for item in PlacerTransport(attempts=1, poses=["current", "direct"]).ask(stage)]
+    labels = [item.label for item in PlacerTransport(rounds=1, proposers=["current", "direct"]).ask(stage)]
     assert labels == ["current", "direct"]
     assert placement.contact_particle != int(stage.priorities.argmax())
     assert float(placement.pose[0, 1]) >= 0.4
@@ -159,20 +160,20 @@ def test_a_contact_point_out_of_reach_is_passed_over() -> None:
 
 def test_current_and_apart() -> None:
     stage = make_stage([block(widths=(0.4, 0.06, 0.06))], balls((0.2, 0.4, 0.5), (0.8, 0.4, 0.5)), (0.65, 0.4, 0.5))
-    current, apart = PlacerTransport(poses=["current", "apart"]).ask(stage)
+    current, apart = PlacerTransport(proposers=["current", "apart"]).ask(stage)
     assert torch.equal(current.pose, stage.state.manipulator_pose[0])
     assert float((apart.pose[0, :3] - apart.pose[1, :3]).norm()) > 0.06
     assert all(0.0 <= gap < 1e-3 for gap in gaps(stage, apart))
     inside = stage.state.manipulator_pose.clone()
     inside[0, 0, 0] = 0.5
-    moved = Stage(0, stage.scene, stage.state.with_manipulators(inside), stage.target, stage.priorities, stage.generator)
-    assert [item.label for item in PlacerTransport(poses=["current", "apart"]).ask(moved)] == ["apart"]
+    moved = Stage(0, stage.scene, stage.state.with_manipulators(inside), stage.target, stage.transport, stage.generator)
+    assert [item.label for item in PlacerTransport(proposers=["current", "apart"]).ask(moved)] == ["apart"]
 
 
-@pytest.mark.parametrize("poses", [["sideways"], [], ["left-right", "left-right"]])
-def test_unknown_poses_are_named(poses: list[str]) -> None:
-    with pytest.raises(InputError, match=r"poses: got .*left-right"):
-        PlacerTransport(poses=poses)
+@pytest.mark.parametrize("proposers", [["sideways"], [], ["left-right", "left-right"]])
+def test_unknown_proposers_are_named(proposers: list[str]) -> None:
+    with pytest.raises(InputError, match=r"proposers: got .*left-right"):
+        PlacerTransport(proposers=proposers)
 
 
 @pytest.mark.parametrize("direction", GRASP_DIRECTIONS.values())

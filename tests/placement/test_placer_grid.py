@@ -13,6 +13,7 @@ from cpdeform.core.scene import BodyBox, Manipulator, ManipulatorBox, Manipulato
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
 from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulators
+from cpdeform.testing.placer import transport_of
 
 MOVES = (0.01, 0.01, 0.01)
 
@@ -26,7 +27,7 @@ def stage(*tools: Manipulator, count: int = 2000, dtype: torch.dtype = torch.flo
     scene = Scene(bodies=(body,), manipulators=tools)
     state = initial_state(scene, dtype=dtype)
     priorities = torch.zeros(count, dtype=dtype)
-    return Stage(0, scene, state, state.position[0], priorities, torch.Generator().manual_seed(0))
+    return Stage(0, scene, state, state.position[0], transport_of(priorities), torch.Generator().manual_seed(0))
 
 
 def distances(stage: Stage, tool: int, position: torch.Tensor) -> torch.Tensor:

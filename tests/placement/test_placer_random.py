@@ -21,8 +21,7 @@ def stage(seed: int = 0) -> Stage:
         manipulators=(ManipulatorSphere(position=(0.5, 0.7, 0.5), radius=0.03, action_scale=(0.01, 0.01, 0.01)),),
     )
     state = initial_state(scene)
-    nothing = torch.full((3000,), torch.nan)
-    return Stage(0, scene, state, state.position[0], nothing, torch.Generator().manual_seed(seed))
+    return Stage(0, scene, state, state.position[0], None, torch.Generator().manual_seed(seed))
 
 
 def poses(placements: list[Proposal]) -> torch.Tensor:
@@ -85,10 +84,10 @@ def test_gives_up_where_nothing_can_be_touched() -> None:
     here = stage()
     tool = here.scene.manipulators[0].model_copy(update={"lower_bound": (0.0, 0.8, 0.0)})
     object.__setattr__(here, "scene", here.scene.model_copy(update={"manipulators": (tool,)}))
-    assert PlacerRandom(candidates=2, attempts=3).ask(here) == []
+    assert PlacerRandom(candidates=2, draws=3).ask(here) == []
 
 
-@pytest.mark.parametrize("name", ["candidates", "attempts", "rounds"])
+@pytest.mark.parametrize("name", ["candidates", "draws", "rounds"])
 def test_options_are_checked(name: str) -> None:
     with pytest.raises(InputError, match=f"{name}: got 0"):
         PlacerRandom(**{name: 0})

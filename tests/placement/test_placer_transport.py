@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import pytest
@@ -13,7 +14,9 @@ from cpdeform.core.placer import Proposal, Stage
 from cpdeform.core.scene import BodyBox, ManipulatorCapsule, Scene
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
-from cpdeform.placement.transport import PlacerTransport, score_loss
+from cpdeform.placement.contact_search import score_loss
+from cpdeform.placement.transport import PlacerTransport
+from cpdeform.testing.placer import transport_of
 
 STROKE = torch.tensor([[0.42, 0.1, 0.45], [0.55, 0.1, 0.58]])
 
@@ -34,7 +37,7 @@ def board(count: int = 3000, dtype: torch.dtype = torch.float32, **tool: Any) ->
     )
     state = initial_state(scene, dtype=dtype)
     priorities = 0.03 * torch.exp(-((along_stroke(state.position[0]) / 0.02) ** 2))
-    return Stage(0, scene, state, state.position[0], priorities, torch.Generator().manual_seed(0))
+    return Stage(0, scene, state, state.position[0], transport_of(priorities), torch.Generator().manual_seed(0))
 
 
 def distances(stage: Stage, placement: Proposal) -> Tensor:
@@ -85,7 +88,7 @@ def test_score_loss_is_the_difference_to_touching_everything() -> None:
 
 def test_negative_priorities_do_not_push_the_tool_off_the_body() -> None:
     stage = board()
-    object.__setattr__(stage, "priorities", stage.priorities - stage.priorities.mean())
+    stage = dataclasses.replace(stage, transport=transport_of(stage.priorities - stage.priorities.mean()))
     (placement,) = PlacerTransport().ask(stage)
     assert -1e-6 <= float(distances(stage, placement).min()) <= 6e-4
     (free,) = PlacerTransport(distance_scale=1.0, max_gap=None).ask(stage)
@@ -119,7 +122,7 @@ def test_is_deterministic_and_leaves_the_state_alone() -> None:
 
 def test_unusable_inputs_are_named() -> None:
     stage = board(100)
-    object.__setattr__(stage, "priorities", torch.full((100,), torch.nan))
+    stage = dataclasses.replace(stage, transport=transport_of(torch.full((100,), torch.nan)))
     with pytest.raises(InputError, match="100 not finite"):
         PlacerTransport().ask(stage)
     with pytest.raises(InputError, match="distance_scale: got 0"):
@@ -138,6 +141,6 @@ def test_bodies_that_touch_are_ranked_as_one() -> None:
     tip = (x < 0.45) & (y < 0.08)
     priorities = torch.where(y > 0.15, 0.005, torch.where(tip, 0.02, -0.01))
     assert priorities[:1000].mean() < priorities[1000:].mean()
-    stage = Stage(0, scene, state, state.position[0], priorities, torch.Generator().manual_seed(0))
+    stage = Stage(0, scene, state, state.position[0], transport_of(priorities), torch.Generator().manual_seed(0))
     placements = PlacerTransport(distance_scale=0.01, max_gap=0.005).ask(stage)
     assert [bool(tip[placement.contact_particle]) for placement in placements] == [True]

@@ -10,15 +10,20 @@ from cpdeform_toy.simulator import SimulatorToy
 
 from cpdeform.core.errors import CapabilityError, InputError, UnknownNameError
 from cpdeform.core.objective import Objective, ObjectiveResult
+from cpdeform.core.ot import TransportProblem
 from cpdeform.core.placer import LEAST_GAIN
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.task import load_task
-from cpdeform.planning.algorithm import Planner, failed_contacts, still_trajectory
+from cpdeform.planning.algorithm import Planner, failed_contacts
 from cpdeform.planning.objectives.transport import ObjectiveTransport
 from cpdeform.planning.optimizer import TrajectoryOptimizer
+from cpdeform.planning.phases.descent import PhaseDescent
+from cpdeform.planning.pruner import PrunerHalving, PrunerNone
 from cpdeform.planning.result import Observer, Status
+from cpdeform.planning.still import still_trajectory
 from cpdeform.run.configuration import PrioritiesConfiguration, RunConfiguration
-from cpdeform.run.deform import deform, deform_configuration
+from cpdeform.run.deform import deform
+from cpdeform.run.resolve import resolve
 
 
 class Diary(Observer):
@@ -43,18 +48,17 @@ def task(toy_task_file):
     return load_task(toy_task_file)
 
 
-def planner(
-    task, *, batch_size=4, simulator=None, solver=None, placer=None, iterations=10, noise=0.01, schedule="halving", **options
-):
+def planner(task, *, batch_size=4, simulator=None, solver=None, placer=None, iterations=10, noise=0.01, pruner=None, **options):
     simulator = simulator or SimulatorToy(task.scene, batch_size=batch_size)
     solver = solver or OTSolverToy()
+    optimizer = TrajectoryOptimizer(iterations=iterations, initial_noise=noise, pruner=pruner or PrunerHalving())
     return Planner(
         task=task,
         simulator=simulator,
         ot_solver=solver,
         placer=placer or PlacerToy(),
         objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene),
-        optimizer=TrajectoryOptimizer(iterations=iterations, initial_noise=noise, schedule=schedule),
+        phases=(PhaseDescent(optimizer=optimizer),),
         **options,
     )
 
@@ -148,12 +152,10 @@ def test_statuses_are_data_with_advice(task):
 
 def test_a_plan_that_only_a_warm_start_flatters_is_not_executed(task):
     class Flattering(Objective):
-        def begin(self, start):
-            return dataclasses.replace(self.evaluate(start), loss=torch.ones(1))
-
-        def evaluate(self, trajectory):
+        def evaluate(self, trajectory, warm=None):
             positions = trajectory.positions
-            return ObjectiveResult(loss=torch.full((len(positions),), 0.5), grad_positions=torch.zeros_like(positions))
+            loss = torch.full((len(positions),), 1.0 if warm is None else 0.5)
+            return ObjectiveResult(loss=loss, grad_positions=torch.zeros_like(positions), warm=("start",) * len(positions))
 
     made = dataclasses.replace(planner(task, iterations=2), objective=Flattering())
     (stage,) = made.run(stages=1).stages
@@ -172,9 +174,10 @@ def test_what_came_before_a_failed_stage_is_kept(task):
     assert result.loss_final < result.loss_initial
 
 
-def test_splitting_into_batches_changes_nothing(task):
-    # successive halving compares the worlds of a batch, so that there the batches do matter
-    whole, split = (planner(task, placer=PlacerToy(count=5), batch_size=size, noise=0.3, schedule="paper") for size in (5, 2))
+@pytest.mark.parametrize("pruner", [PrunerNone(), PrunerHalving(least_iterations=1)])
+def test_splitting_into_batches_changes_nothing(task, pruner):
+    """Nor with successive halving, which compares all candidates of a round."""
+    whole, split = (planner(task, placer=PlacerToy(count=5), batch_size=size, noise=0.3, pruner=pruner) for size in (5, 2))
     results = [made.run(stages=1).stages[0] for made in (whole, split)]
     assert (whole.simulator.largest_batch, split.simulator.largest_batch) == (5, 2)
     losses = [[candidate.loss for candidate in result.candidates] for result in results]
@@ -246,7 +249,7 @@ def test_deform_by_name_and_by_object(toy_task_file, toy_entry_points):
     optimizer = TrajectoryOptimizer(iterations=4)
     options = {"placer": "toy", "optimizer": optimizer, "registry": registry, "stages": 1}
     named = deform(str(toy_task_file), simulator="toy", ot_solver="toy", **options)
-    assert named.names == {"backend": "toy", "ot": "toy", "placer": "toy"}
+    assert named.names == {"backend": "toy", "ot": "toy", "placer": "toy", "strategy": "cpdeform"}
     task = load_task(toy_task_file)
     made = deform(task, simulator=SimulatorToy(task.scene, batch_size=8), ot_solver=OTSolverToy(), **options)
     assert made.names["backend"] == "SimulatorToy"
@@ -267,20 +270,20 @@ def test_deform_by_configuration(toy_task_file, toy_entry_points):
         placer_options={"count": 2},
         simulator_options={"batch_size": 1},
     )
-    result = deform_configuration(configuration, registry=registry)
+    result = resolve(configuration, registry=registry).run()
     assert (result.state.particle_count, len(result.stages[0].candidates)) == (20, 2)
     bad = configuration.model_copy(update={"simulator_options": {"device": "cpu"}})
     with pytest.raises(InputError, match="Set device instead"):
-        deform_configuration(bad, registry=registry)
+        resolve(bad, registry=registry)
     shifted = configuration.model_copy(update={"priorities": PrioritiesConfiguration(kind="displacement")})
     with pytest.raises(
         InputError, match=r"transport solver toy has no option exponent\. Set it with --set priorities.kind=potential"
     ):
-        deform_configuration(shifted, registry=registry)
+        resolve(shifted, registry=registry).run()
 
 
 def test_priorities_may_be_displacements_which_an_exact_solver_has_too(task):
     for solver in (OTSolverToy(), OTSolverExactToy()):
-        (stage,) = planner(task, solver=solver, priority_kind="displacement", iterations=2).run(stages=1).stages
+        (stage,) = planner(task, solver=solver, problem=TransportProblem(exponent=2), iterations=2).run(stages=1).stages
         way = torch.as_tensor(task.load_target()).mean(dim=0) - stage.state_before.position[0].mean(dim=0)
         assert torch.allclose(stage.priorities, way.norm().to(stage.priorities))

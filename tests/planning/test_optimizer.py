@@ -8,6 +8,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.objective import ObjectiveAutograd
 from cpdeform.core.task import load_task
 from cpdeform.planning.optimizer import TrajectoryOptimizer
+from cpdeform.planning.pruner import PrunerNone
 
 
 class Distance(ObjectiveAutograd):
@@ -39,7 +40,7 @@ def goal(state, shift):
 
 
 def test_reaches_the_optimum(simulator, state):
-    optimizer = TrajectoryOptimizer(iterations=200, learning_rate=0.02, patience=200, schedule="paper")
+    optimizer = TrajectoryOptimizer(iterations=200, learning_rate=0.02, patience=200, pruner=PrunerNone())
     seen = []
     objective = Distance(goal(state, [0.03, -0.02, 0.01]))
     result = optimizer.minimize(simulator, state, zeros(), objective, on_iteration=seen.append)
@@ -55,7 +56,7 @@ def test_reaches_the_optimum(simulator, state):
 def test_rest_stays_as_it_is_and_counts(simulator, state):
     first = zeros()
     first[:, 3:] = 0.25
-    optimizer = TrajectoryOptimizer(iterations=120, learning_rate=0.02, patience=120, schedule="paper")
+    optimizer = TrajectoryOptimizer(iterations=120, learning_rate=0.02, patience=120, pruner=PrunerNone())
     result = optimizer.minimize(simulator, state, first, Distance(goal(state, [0.02, 0.02, 0.02])), rest_steps=2)
     assert torch.equal(result.actions[:, 3:], first[:, 3:].double())
     # the plan of the first three steps makes up for what the last two do
@@ -84,7 +85,7 @@ def test_a_world_that_breaks_keeps_its_best_and_the_others_go_on(toy_task_file):
     state = simulator.initial_state()
     actions = zeros(2)
     actions[1] = -1.0
-    optimizer = TrajectoryOptimizer(iterations=8, schedule="paper")
+    optimizer = TrajectoryOptimizer(iterations=8, pruner=PrunerNone())
     result = optimizer.minimize(simulator, state, actions, Distance(goal(state, [0.4, 0.0, 0.0])))
     assert result.finite.tolist() == [False, True]
     assert torch.isfinite(result.loss).all()
@@ -183,7 +184,7 @@ def test_halving_drops_the_worse_half_and_the_winner_is_that_of_the_paper(simula
     objective = Remembering(goal(state, shift))
     options = {"iterations": 24, "learning_rate": 0.01, "patience": 24}
     halved = TrajectoryOptimizer(**options).minimize(simulator, state, first, objective)
-    full = TrajectoryOptimizer(**options, schedule="paper").minimize(simulator, state, first, Distance(goal(state, shift)))
+    full = TrajectoryOptimizer(**options, pruner=PrunerNone()).minimize(simulator, state, first, Distance(goal(state, shift)))
     # of 3 worlds 2 are left after 1/4 and 1 after 1/2 of the iterations; what is kept is counted within the last batch
     assert objective.sizes == [3] * 6 + [2] * 6 + [1] * 12
     assert objective.kept == [[0, 1], [1]]
@@ -205,7 +206,7 @@ def test_a_single_world_is_not_dropped(simulator, state):
     options = {"iterations": 8, "patience": 8}
     objective = Distance(goal(state, [0.05, 0.0, 0.0]))
     halved = TrajectoryOptimizer(**options).minimize(simulator, one, zeros(1), objective)
-    full = TrajectoryOptimizer(**options, schedule="paper").minimize(simulator, one, zeros(1), objective)
+    full = TrajectoryOptimizer(**options, pruner=PrunerNone()).minimize(simulator, one, zeros(1), objective)
     assert torch.equal(halved.actions, full.actions)
     assert halved.gradient_evaluations == full.gradient_evaluations == 8
 

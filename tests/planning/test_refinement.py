@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from cpdeform.planning.refinement import REFINEMENT, Refinement
 from cpdeform_toy.parts import OTSolverToy, PlacerToy
 from cpdeform_toy.simulator import SimulatorToy
 
@@ -17,8 +16,10 @@ from cpdeform.planning.objectives.density import ObjectiveDensity
 from cpdeform.planning.objectives.soft_iou import ObjectiveSoftIoU
 from cpdeform.planning.objectives.transport import ObjectiveTransport
 from cpdeform.planning.optimizer import TrajectoryOptimizer
-from cpdeform.run.configuration import RefinementConfiguration, RunConfiguration, with_task_settings
-from cpdeform.run.deform import deform, make_refinement
+from cpdeform.planning.phases.descent import REFINEMENT, PhaseDescent, PhaseRefinement
+from cpdeform.run.configuration import RefinementConfiguration
+from cpdeform.run.deform import deform
+from cpdeform.run.parts import make_refinement
 
 ITERATIONS = 8
 
@@ -40,15 +41,15 @@ def task(toy_task_file):
 
 def run(task, point=None, **options):
     optimizer = TrajectoryOptimizer(iterations=ITERATIONS, learning_rate=0.02)
-    refinement = None if point is None else Refinement(objective=Offset(point), optimizer=optimizer)
+    search = PhaseDescent(optimizer=TrajectoryOptimizer(iterations=2))
+    refinement = () if point is None else (PhaseRefinement(objective=Offset(point), optimizer=optimizer),)
     planner = Planner(
         task=task,
         simulator=SimulatorToy(task.scene, batch_size=4),
         ot_solver=OTSolverToy(),
         placer=PlacerToy(),
         objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene),
-        optimizer=TrajectoryOptimizer(iterations=2),
-        refinement=refinement,
+        phases=(search, *refinement),
         **options,
     )
     return planner.run(stages=1).stages[0]
@@ -88,7 +89,7 @@ def test_a_plan_worse_than_leaving_the_shape_alone_is_dropped(task):
     assert refined.loss == plain.loss < plain.loss_before
 
 
-def test_the_configuration_makes_it_and_the_paper_does_not(task):
+def test_the_configuration_makes_it(task):
     simulator, registry = SimulatorToy(task.scene, batch_size=1), load_registry()
 
     def make(most=40, **options):
@@ -97,23 +98,20 @@ def test_the_configuration_makes_it_and_the_paper_does_not(task):
 
     assert make() is None
     made = make(iterations=9, learning_rate=0.5, patience=3)
-    assert (made.optimizer.iterations, made.optimizer.learning_rate, made.optimizer.patience) == (9, 0.5, 3)
-    assert make(most=4, iterations=9).optimizer.iterations == 4
-    assert isinstance(made.objective, ObjectiveDensity)
-    assert isinstance(make(iterations=9, kind="iou").objective, ObjectiveSoftIoU)
-    with_one = task.model_copy(update={"settings": {**task.settings, "refinement": {"iterations": 9}}})
-    assert with_task_settings(RunConfiguration(), with_one).refinement.iterations == 9
-    assert with_task_settings(RunConfiguration(algorithm="paper"), with_one).refinement.iterations == 0
+    objective, optimizer = made
+    assert (optimizer.iterations, optimizer.learning_rate, optimizer.patience) == (9, 0.5, 3)
+    assert make(most=4, iterations=9)[1].iterations == 4
+    assert isinstance(objective, ObjectiveDensity)
+    assert isinstance(make(iterations=9, kind="iou")[0], ObjectiveSoftIoU)
 
 
 def test_refinement_by_transport_has_nothing_that_a_task_adds_for_the_search(task):
     """Its loss is that of the plain cost, and the plan that it leaves has a lower one."""
     weights = {"axis_scale": [1.0, 4.0, 1.0], "coast_steps": 0.1}
     settings = {"objective": weights, "refinement": {"kind": "transport", "iterations": ITERATIONS}}
-    with_both = task.model_copy(update={"settings": {**task.settings, **settings}})
     parts = {"simulator": SimulatorToy(task.scene, batch_size=4), "ot_solver": OTSolverToy(), "placer": PlacerToy()}
     optimizer = TrajectoryOptimizer(iterations=ITERATIONS, learning_rate=0.02)
-    (stage,) = deform(with_both, **parts, optimizer=optimizer, stages=1).stages
+    (stage,) = deform(task, **parts, settings=settings, optimizer=optimizer, stages=1).stages
     refined = [float(iteration.loss[0]) for iteration in stage.history if iteration.phase == REFINEMENT]
     plain = ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene)
     start = SimulatorToy(task.scene, batch_size=1)
@@ -125,12 +123,12 @@ def test_refinement_by_transport_has_nothing_that_a_task_adds_for_the_search(tas
 
 
 def test_a_loss_given_as_an_object_is_not_followed_by_another(task):
-    with_one = task.model_copy(update={"settings": {**task.settings, "refinement": {"iterations": 9}}})
     parts = {"simulator": SimulatorToy(task.scene, batch_size=4), "ot_solver": OTSolverToy(), "placer": PlacerToy()}
     options = {**parts, "optimizer": TrajectoryOptimizer(iterations=2), "stages": 1}
-    (refined,) = deform(with_one, **options).stages
+    options["settings"] = {"refinement": {"iterations": 9}}
+    (refined,) = deform(task, **options).stages
     assert [iteration.phase for iteration in refined.history] == ["search"] * 2 + [REFINEMENT] * 2
-    (plain,) = deform(with_one, objective=Offset(goal(task)), **options).stages
+    (plain,) = deform(task, objective=Offset(goal(task)), **options).stages
     assert [iteration.phase for iteration in plain.history] == ["search"] * 2
 
 

@@ -123,47 +123,49 @@ def test_clouds_of_different_size_have_their_own_subsets() -> None:
 def test_warm_starts_refresh_and_reset() -> None:
     path, solver = trajectory(worlds=1), OTSolverMean()
     objective = ObjectiveTransport(solver, goal(), refresh=3)
+    # The chain is the caller's: it hands each result's `warm` to the next call.
+    warm = objective.evaluate(path).warm
+    moved = dataclasses.replace(path, positions=path.positions + 1e-3)
     for _ in range(5):
-        objective.evaluate(path)
-    objective.reset()
+        warm = objective.evaluate(moved, warm).warm
     objective.evaluate(path)
-    assert solver.warm == [False, True, True, False, True, False]
+    assert solver.warm == [False, True, True, True, False, True, False]
 
 
 def test_every_batch_starts_from_the_solution_of_the_stages_start() -> None:
     solver = OTSolverMean()
     objective = ObjectiveTransport(solver, goal(), refresh=2)
-    objective.evaluate(trajectory(worlds=1))
-    start = float(objective.begin(trajectory(worlds=1)).loss[0])
+    start = objective.evaluate(trajectory(worlds=1))
+    assert start.warm is not None
     for _ in range(2):
-        objective.reset()
-        objective.evaluate(trajectory())
-    assert solver.warm == [False, False, True, True, True, True]
-    assert all(call[2] is not None and float(call[2].value) == start for call in solver.calls[2:])
-    objective.evaluate(trajectory())
-    objective.evaluate(trajectory())
-    assert solver.warm[6:] == [True, True, False, False]
-    assert len(solver.calls) == 10
-    elsewhere = trajectory(worlds=1)
-    objective.begin(dataclasses.replace(elsewhere, positions=elsewhere.positions + 0.01))
-    assert solver.warm[10:] == [False]
+        found = objective.evaluate(trajectory(), start.warm * 2)
+    assert solver.warm == [False, True, True, True, True]
+    assert all(call[2] is not None and float(call[2].value) == float(start.loss[0]) for call in solver.calls[1:])
+    found = objective.evaluate(trajectory(), found.warm)
+    objective.evaluate(trajectory(), found.warm)
+    assert solver.warm[5:] == [True, True, False, False]
+    with pytest.raises(InputError, match="warm: got 1 entries, expected 2"):
+        objective.evaluate(trajectory(), start.warm)
+    with pytest.raises(InputError, match="of an earlier result of this objective"):
+        objective.evaluate(trajectory(), ["something", "else"])
 
 
 def test_a_start_that_is_known_is_not_solved_again() -> None:
     """A stage begins with the particles that the one before ended with."""
     solver, path = OTSolverMean(), trajectory(worlds=1)
     objective = ObjectiveTransport(solver, goal(), coast_steps=2.0)
-    first = objective.begin(path)
+    first = objective.evaluate(path)
     objective.evaluate(trajectory())
     still = dataclasses.replace(path, positions=path.positions[:, -1:].repeat(1, 4, 1, 1))
-    again = objective.begin(still)
+    again = objective.evaluate(still, first.warm)
     assert len(solver.calls) == 3
     # Only the term for particles that still move differs.
-    cost = ObjectiveTransport(OTSolverMean(), goal()).begin(still)
+    cost = ObjectiveTransport(OTSolverMean(), goal()).evaluate(still)
     torch.testing.assert_close(again.loss, cost.loss)
     torch.testing.assert_close(again.grad_positions[:, -1], cost.grad_positions[:, -1])
     assert float(first.loss[0]) > float(again.loss[0])
-    objective.evaluate(trajectory())
+    assert again.warm is not None
+    objective.evaluate(trajectory(), again.warm * 2)
     assert [call[2] is not None and float(call[2].value) == float(cost.loss[0]) for call in solver.calls[3:]] == [True, True]
 
 
@@ -171,7 +173,8 @@ def test_every_world_starts_from_its_own_solution() -> None:
     solver = OTSolverMean()
     objective = ObjectiveTransport(solver, goal())
     first = objective.evaluate(trajectory())
-    objective.evaluate(trajectory())
+    moved = trajectory()
+    objective.evaluate(dataclasses.replace(moved, positions=moved.positions + 1e-3), first.warm)
     assert [float(call[2].value) for call in solver.calls[2:] if call[2] is not None] == first.loss.tolist()
     objective.evaluate(trajectory(worlds=1))
     assert solver.warm == [False, False, True, True, False]
