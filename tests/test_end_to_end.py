@@ -64,8 +64,17 @@ def test_every_combination_runs_from_the_command_line(ot: str, placer: str, boar
     summary = json.loads(result.stdout.splitlines()[-1])
     expected = {"task": "board", "backend": "warp", "ot": ot, "placer": placer, "seed": 0, "gradient_evaluations": 4}
     assert {key: summary[key] for key in expected} == expected
-    assert summary["loss_final"] <= summary["loss_initial"]
-    assert load_record(out).status == summary["status"]
+    record = load_record(out)
+    assert record.status == summary["status"]
+    # Only a plan that lowers the loss is executed, and then the run has finished.
+    assert result.exit_code == (0 if summary["status"] == "finished" else 1)
+    moved = float((record.state.position - record.stages[0].state_before.position).abs().max())
+    if summary["status"] == "finished":
+        assert summary["loss_final"] < summary["loss_initial"]
+        assert moved > 1e-5
+    else:
+        assert summary["loss_final"] == summary["loss_initial"]
+        assert moved == 0.0
     if placer == "transport":
         assert summary["status"] == "finished"
         assert summary["loss_final"] < 0.95 * summary["loss_initial"]

@@ -7,30 +7,20 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from cpdeform.core.errors import InputError
 from cpdeform.core.sampling import body_index
-from cpdeform.core.scene import (
-    WALL_NODES,
-    Manipulator,
-    ManipulatorBox,
-    ManipulatorChopsticks,
-    ManipulatorCylinder,
-    ManipulatorRod,
-    ManipulatorSphere,
-    Scene,
-    Vector3,
-)
+from cpdeform.core.scene import WALL_NODES, Manipulator, Scene, Vector3
+from cpdeform.core.shapes.kinds import MANIPULATORS
 
-SPHERE, CAPSULE, BOX, CYLINDER, TORUS, ROLLING_PIN, CHOPSTICKS = range(7)
-KIND_NUMBERS = {
-    "Sphere": SPHERE,
-    "Capsule": CAPSULE,
-    "Box": BOX,
-    "Cylinder": CYLINDER,
-    "Torus": TORUS,
-    "RollingPin": ROLLING_PIN,
-    "Chopsticks": CHOPSTICKS,
-}
+KIND_NUMBERS = {kind: number for number, kind in enumerate(MANIPULATORS)}
 """Numbers of the manipulator kinds inside kernels."""
+
+SPHERE, CAPSULE, BOX = KIND_NUMBERS["Sphere"], KIND_NUMBERS["Capsule"], KIND_NUMBERS["Box"]
+CYLINDER, TORUS = KIND_NUMBERS["Cylinder"], KIND_NUMBERS["Torus"]
+ROLLING_PIN, CHOPSTICKS = KIND_NUMBERS["RollingPin"], KIND_NUMBERS["Chopsticks"]
+
+MOST_LENGTHS = 4
+"""Lengths that kernels have room for in a tool's record."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,21 +83,28 @@ class ToolNumbers:
     upper: Vector3
 
 
-def tool_size(manipulator: Manipulator) -> tuple[float, ...]:
-    """The lengths that a manipulator's signed distance depends on, padded to four.
+def kind_number(manipulator: Manipulator) -> int:
+    """The number of a tool's kind inside kernels.
 
-    Sphere (radius); Capsule, RollingPin and Chopsticks (radius, height); Box (half extents, rounding); Cylinder (radius, half
-    height); Torus (major radius, tube radius).
+    Raises:
+        InputError: The kind is not in the list of `cpdeform.core.shapes.kinds`.
     """
-    if isinstance(manipulator, ManipulatorSphere):
-        return (manipulator.radius, 0.0, 0.0, 0.0)
-    if isinstance(manipulator, (ManipulatorRod, ManipulatorChopsticks)):
-        return (manipulator.radius, manipulator.height, 0.0, 0.0)
-    if isinstance(manipulator, ManipulatorBox):
-        return (*manipulator.half_extents, manipulator.rounding)
-    if isinstance(manipulator, ManipulatorCylinder):
-        return (manipulator.radius, manipulator.half_height, 0.0, 0.0)
-    return (manipulator.major_radius, manipulator.tube_radius, 0.0, 0.0)
+    if manipulator.kind not in KIND_NUMBERS:
+        expected = f"a kind that kernels have a number for: {', '.join(KIND_NUMBERS)}"
+        raise InputError("manipulator", came=f"one of kind {manipulator.kind}", expected=expected)
+    return KIND_NUMBERS[manipulator.kind]
+
+
+def tool_size(manipulator: Manipulator) -> tuple[float, ...]:
+    """The lengths that a manipulator's signed distance depends on, see `ManipulatorBase.kernel_lengths`, padded to four.
+
+    Raises:
+        InputError: There are more.
+    """
+    lengths = manipulator.kernel_lengths
+    if len(lengths) > MOST_LENGTHS:
+        raise InputError(f"{manipulator.kind}.kernel_lengths", came=f"{len(lengths)} lengths", expected=f"at most {MOST_LENGTHS}")
+    return (*lengths, *[0.0] * (MOST_LENGTHS - len(lengths)))
 
 
 def scene_numbers(scene: Scene) -> SceneNumbers:
@@ -139,7 +136,7 @@ def tool_numbers(scene: Scene) -> list[ToolNumbers]:
         scale = [value / scene.substeps for value in manipulator.action_scale]
         tools.append(
             ToolNumbers(
-                kind=KIND_NUMBERS[manipulator.kind],
+                kind=kind_number(manipulator),
                 size=tool_size(manipulator),
                 friction=manipulator.friction,
                 action_offset=offset,

@@ -5,20 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cpdeform.core.scene import BodyBox, BodySphere, Scene
-
-
-def _sample_box(body: BodyBox, generator: np.random.Generator | np.random.RandomState) -> NDArray[np.float64]:
-    offset = generator.uniform(-0.5, 0.5, (body.particle_count, 3))
-    return np.asarray(body.position, dtype=np.float64) + offset * np.asarray(body.widths, dtype=np.float64)
-
-
-def _sample_sphere(body: BodySphere, generator: np.random.Generator | np.random.RandomState) -> NDArray[np.float64]:
-    direction = generator.standard_normal((body.particle_count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    share = generator.uniform(0.0, 1.0, (body.particle_count, 1)) ** (1.0 / 3.0)
-    # in PlasticineLab's order, so that its sample is met to the last bit
-    return np.asarray(body.position) + direction * share * body.radius
+from cpdeform.core.scene import Scene
 
 
 def sample_particles(scene: Scene) -> NDArray[np.float64]:
@@ -33,9 +20,7 @@ def sample_particles(scene: Scene) -> NDArray[np.float64]:
     # NumPy's legacy generator is what PlasticineLab draws from; its stream is frozen (NEP 19).
     make = np.random.RandomState if scene.sampling == "plasticinelab" else np.random.default_rng
     generator = make(scene.sampling_seed)
-    parts = [
-        _sample_box(body, generator) if isinstance(body, BodyBox) else _sample_sphere(body, generator) for body in scene.bodies
-    ]
+    parts = [body.sample(generator) for body in scene.bodies]
     lower, upper = scene.domain
     return np.clip(np.concatenate(parts), lower, upper)
 

@@ -9,229 +9,50 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Annotated, ClassVar, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.material import Material
+from cpdeform.core.model import FrozenModel, NonNegativeFloat, PositiveFloat, Quaternion, Vector3
+from cpdeform.core.shapes.body import BodyBase
+from cpdeform.core.shapes.box import BodyBox, ManipulatorBox
+from cpdeform.core.shapes.chopsticks import ManipulatorChopsticks
+from cpdeform.core.shapes.cylinder import ManipulatorCylinder
+from cpdeform.core.shapes.kinds import Body, Manipulator
+from cpdeform.core.shapes.manipulator import ManipulatorBase
+from cpdeform.core.shapes.rod import ManipulatorCapsule, ManipulatorRod, ManipulatorRollingPin
+from cpdeform.core.shapes.sphere import BodySphere, ManipulatorSphere
+from cpdeform.core.shapes.torus import ManipulatorTorus
 
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NonNegativeFloat = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+__all__ = [
+    "WALL_NODES",
+    "Body",
+    "BodyBase",
+    "BodyBox",
+    "BodySphere",
+    "FrozenModel",
+    "Manipulator",
+    "ManipulatorBase",
+    "ManipulatorBox",
+    "ManipulatorCapsule",
+    "ManipulatorChopsticks",
+    "ManipulatorCylinder",
+    "ManipulatorRod",
+    "ManipulatorRollingPin",
+    "ManipulatorSphere",
+    "ManipulatorTorus",
+    "Material",
+    "NonNegativeFloat",
+    "PositiveFloat",
+    "Quaternion",
+    "Scene",
+    "Vector3",
+]
 
 WALL_NODES = 3
 """Width of the boundary layer at each face of the domain, in grid nodes."""
-
-
-class FrozenModel(BaseModel):
-    """Base of all data models: immutable, no unknown fields, no infinities."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Material(FrozenModel):
-    """Fixed-corotated elasticity with von Mises plasticity.
-
-    Attributes:
-        youngs_modulus: Young's modulus E, stress units (density 1, lengths in domain edges, seconds).
-        poisson_ratio: Poisson's ratio nu, dimensionless, in (-1, 0.5).
-        yield_stress: Von Mises yield stress, stress units.
-    """
-
-    youngs_modulus: PositiveFloat = 5000.0
-    poisson_ratio: float = Field(default=0.2, gt=-1.0, lt=0.5)
-    yield_stress: PositiveFloat = 50.0
-
-    @property
-    def shear_modulus(self) -> float:
-        """First Lame parameter mu = E / (2 (1 + nu)), stress units."""
-        return self.youngs_modulus / (2.0 * (1.0 + self.poisson_ratio))
-
-    @property
-    def lame_lambda(self) -> float:
-        """Second Lame parameter lambda = E nu / ((1 + nu)(1 - 2 nu)), stress units."""
-        return self.youngs_modulus * self.poisson_ratio / ((1.0 + self.poisson_ratio) * (1.0 - 2.0 * self.poisson_ratio))
-
-
-class BodyBox(FrozenModel):
-    """An axis-aligned block of clay.
-
-    Attributes:
-        position: Centre, length units.
-        widths: Full edge lengths along x, y, z, length units.
-        particle_count: Number of particles sampled uniformly in the block.
-        material: Material of this body; the scene's material where absent.
-    """
-
-    kind: Literal["box"] = "box"
-    position: Vector3
-    widths: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
-    particle_count: int = Field(default=10000, gt=0)
-    material: Material | None = None
-
-    @property
-    def half_extents(self) -> Vector3:
-        """Half of the bounding box's edges, length units."""
-        return (0.5 * self.widths[0], 0.5 * self.widths[1], 0.5 * self.widths[2])
-
-
-class BodySphere(FrozenModel):
-    """A ball of clay.
-
-    Attributes:
-        position: Centre, length units.
-        radius: Radius, length units.
-        particle_count: Number of particles sampled uniformly in the ball.
-        material: Material of this body; the scene's material where absent.
-    """
-
-    kind: Literal["sphere"] = "sphere"
-    position: Vector3
-    radius: PositiveFloat
-    particle_count: int = Field(default=10000, gt=0)
-    material: Material | None = None
-
-    @property
-    def half_extents(self) -> Vector3:
-        """Half of the bounding box's edges, length units."""
-        return (self.radius, self.radius, self.radius)
-
-
-Body = Annotated[BodyBox | BodySphere, Field(discriminator="kind")]
-
-
-class ManipulatorBase(FrozenModel):
-    """A rigid tool, moved by actions or fixed.
-
-    Attributes:
-        position: Start position of the local origin, length units.
-        rotation_wxyz: Start rotation as a unit quaternion (w, x, y, z), local frame to world frame.
-        friction: Coulomb friction coefficient against the clay, dimensionless.
-        action_scale: Motion per environment step at action 1: three translations (length units) and optionally three
-            rotations (radians, world frame). Empty: the tool does not move. Kinds with motions of their own say so.
-        lower_bound: The position is clipped to stay above this corner, length units.
-        upper_bound: The position is clipped to stay below this corner, length units.
-    """
-
-    position: Vector3
-    rotation_wxyz: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    friction: NonNegativeFloat = 0.9
-    action_scale: tuple[NonNegativeFloat, ...] = ()
-    lower_bound: Vector3 = (0.0, 0.0, 0.0)
-    upper_bound: Vector3 = (1.0, 1.0, 1.0)
-
-    action_meanings: ClassVar[Mapping[int, str]] = MappingProxyType({0: "fixed", 3: "translation", 6: "translation, rotation"})
-    """What the possible numbers of action components stand for."""
-
-    @model_validator(mode="after")
-    def _check(self) -> ManipulatorBase:
-        if len(self.action_scale) not in self.action_meanings:
-            expected = " or ".join(f"{count} ({meaning})" for count, meaning in self.action_meanings.items())
-            raise InputError("action_scale", came=f"{len(self.action_scale)} components", expected=expected)
-        norm = sum(component * component for component in self.rotation_wxyz) ** 0.5
-        if not 0.99 < norm < 1.01:
-            raise InputError("rotation_wxyz", came=f"a norm of {norm:.4g}", expected="a unit quaternion (w, x, y, z)")
-        if any(low > high for low, high in zip(self.lower_bound, self.upper_bound, strict=True)):
-            raise InputError("lower_bound", came=f"{self.lower_bound}", expected=f"at most upper_bound = {self.upper_bound}")
-        return self
-
-    @property
-    def action_size(self) -> int:
-        """Number of action components this tool takes."""
-        return len(self.action_scale)
-
-    @property
-    def movable(self) -> bool:
-        """Whether any action moves this tool."""
-        return any(scale > 0.0 for scale in self.action_scale)
-
-
-class ManipulatorSphere(ManipulatorBase):
-    """A ball. Attributes: radius, length units."""
-
-    kind: Literal["Sphere"] = "Sphere"
-    radius: PositiveFloat
-
-
-class ManipulatorRod(ManipulatorBase):
-    """All points within `radius` of the segment y in [-height/2, height/2] of the local frame, length units."""
-
-    radius: PositiveFloat
-    height: PositiveFloat
-
-
-class ManipulatorCapsule(ManipulatorRod):
-    """A rod that is moved like any tool."""
-
-    kind: Literal["Capsule"] = "Capsule"
-
-
-class ManipulatorRollingPin(ManipulatorRod):
-    """A rod that rolls.
-
-    Its three actions turn it about its own axis (radians), rolling it sideways by 0.03 length units a radian, turn it about the
-    vertical (radians), and lift it (length units).
-    """
-
-    kind: Literal["RollingPin"] = "RollingPin"
-    action_meanings: ClassVar[Mapping[int, str]] = MappingProxyType({0: "fixed", 3: "roll, turn, lift"})
-
-
-class ManipulatorChopsticks(ManipulatorBase):
-    """Two parallel rods of `radius` and `height` at x = +-gap/2 of the local frame, whose origin is at their upper ends.
-
-    Attributes:
-        radius: Radius of a rod, length units.
-        height: Length of a rod's segment, length units.
-        gap: Start distance between the rods' axes, length units; actions never close it below 0.06.
-    """
-
-    kind: Literal["Chopsticks"] = "Chopsticks"
-    radius: PositiveFloat
-    height: PositiveFloat
-    gap: PositiveFloat = 0.06
-    action_meanings: ClassVar[Mapping[int, str]] = MappingProxyType(
-        {0: "fixed", 7: "translation, rotation in the tool's own frame, closing of the gap"}
-    )
-
-
-class ManipulatorBox(ManipulatorBase):
-    """A block of `half_extents` (3,), grown by `rounding` on all sides, length units."""
-
-    kind: Literal["Box"] = "Box"
-    half_extents: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
-    rounding: NonNegativeFloat = 0.0
-
-
-class ManipulatorCylinder(ManipulatorBase):
-    """A solid cylinder about the local y axis: `radius` and `half_height`, length units."""
-
-    kind: Literal["Cylinder"] = "Cylinder"
-    radius: PositiveFloat
-    half_height: PositiveFloat
-
-
-class ManipulatorTorus(ManipulatorBase):
-    """A ring about the local y axis: `major_radius` to the tube's centre and `tube_radius`, length units."""
-
-    kind: Literal["Torus"] = "Torus"
-    major_radius: PositiveFloat
-    tube_radius: PositiveFloat
-
-
-Manipulator = Annotated[
-    ManipulatorSphere
-    | ManipulatorCapsule
-    | ManipulatorBox
-    | ManipulatorCylinder
-    | ManipulatorTorus
-    | ManipulatorRollingPin
-    | ManipulatorChopsticks,
-    Field(discriminator="kind"),
-]
 
 
 class Scene(FrozenModel):

@@ -6,22 +6,12 @@ element of the subdifferential, of length at most 1, never nan or infinity.
 
 from __future__ import annotations
 
-from functools import reduce
-
-import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.rotation import rotate_inverse
-from cpdeform.core.scene import (
-    Manipulator,
-    ManipulatorBox,
-    ManipulatorChopsticks,
-    ManipulatorCylinder,
-    ManipulatorRod,
-    ManipulatorSphere,
-    ManipulatorTorus,
-)
+from cpdeform.core.scene import Manipulator
+from cpdeform.core.shapes.manipulator import shape_of
 
 POSE_SIZE = 8
 """Numbers of a tool's pose: position (3), unit quaternion wxyz (4), gap (1); see `State.manipulator_pose`."""
@@ -52,43 +42,9 @@ def signed_distance(manipulator: Manipulator, pose: Tensor, points: Tensor) -> T
 def local_distance(manipulator: Manipulator, x: Tensor, y: Tensor, z: Tensor, *, gap: Tensor | float | None = None) -> Tensor:
     """Signed distance (...) of points given by their coordinates x, y, z (...) in the tool's local frame, length units.
 
-    The `gap` between chopsticks is the tool's start gap where absent.
+    The `gap` between chopsticks defaults to the tool's start gap.
+
+    Raises:
+        InputError: `manipulator` is no tool.
     """
-    match manipulator:
-        case ManipulatorSphere():
-            return _length(x, y, z) - manipulator.radius
-        case ManipulatorRod():
-            return _segment_distance(x, y, z, 0.5 * manipulator.height) - manipulator.radius
-        case ManipulatorChopsticks():
-            half = 0.5 * manipulator.height
-            aside = x.abs() - 0.5 * (manipulator.gap if gap is None else gap)
-            return _segment_distance(aside, y + half, z, half) - manipulator.radius
-        case ManipulatorBox():
-            outside = [axis.abs() - half for axis, half in zip((x, y, z), manipulator.half_extents, strict=True)]
-            return _corner_distance(*outside) - manipulator.rounding
-        case ManipulatorCylinder():
-            return _corner_distance(_length(x, z) - manipulator.radius, y.abs() - manipulator.half_height)
-        case ManipulatorTorus():
-            return _length(_length(x, z) - manipulator.major_radius, y) - manipulator.tube_radius
-    raise InputError("manipulator", came=type(manipulator).__name__, expected="a manipulator of cpdeform.core.scene")
-
-
-def _segment_distance(x: Tensor, y: Tensor, z: Tensor, half: float) -> Tensor:
-    """Distance to the segment y in [-half, half]."""
-    return _length(x, y - y.clamp(-half, half), z)
-
-
-def _length(*components: Tensor) -> Tensor:
-    """Euclidean length; its gradient at zero is zero, where that of a plain square root is nan."""
-    squared = reduce(torch.add, (component * component for component in components))
-    if not squared.requires_grad:
-        return squared.sqrt()
-    positive = squared > 0.0
-    root = torch.where(positive, squared, torch.ones_like(squared)).sqrt()
-    return torch.where(positive, root, torch.zeros_like(root))
-
-
-def _corner_distance(*excess: Tensor) -> Tensor:
-    """Distance to the set where every component of `excess`, each a distance to one pair of faces, is negative."""
-    outside = _length(*(component.clamp(min=0.0) for component in excess))
-    return outside + reduce(torch.maximum, excess).clamp(max=0.0)
+    return shape_of(manipulator, gap=gap).distance(x, y, z)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.sampling import sample_particles
-from cpdeform.core.scene import ManipulatorChopsticks, Scene
+from cpdeform.core.scene import Scene
 
 STRAIN_COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Matrix entries that the six numbers of `State.elastic_strain` stand for."""
@@ -96,8 +96,7 @@ def manipulator_pose(scene: Scene) -> Tensor:
     for manipulator in scene.manipulators:
         norm = sum(component**2 for component in manipulator.rotation_wxyz) ** 0.5
         rotation = [component / norm for component in manipulator.rotation_wxyz]
-        gap = manipulator.gap if isinstance(manipulator, ManipulatorChopsticks) else 0.0
-        rows.append([*manipulator.position, *rotation, gap])
+        rows.append([*manipulator.position, *rotation, manipulator.start_gap])
     return torch.tensor(rows, dtype=torch.float64).reshape(len(rows), 8)
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.rotation import multiply, rotate
-from cpdeform.core.scene import Manipulator, ManipulatorBox, Vector3
+from cpdeform.core.scene import Manipulator, Vector3
 
 GRASP_DIRECTIONS: Mapping[str, Vector3] = MappingProxyType(
     {"left-right": (1.0, 0.0, 0.0), "top-bottom": (0.0, 1.0, 0.0), "front-back": (0.0, 0.0, 1.0)}
@@ -23,7 +23,7 @@ GRASP_DIRECTIONS: Mapping[str, Vector3] = MappingProxyType(
 
 
 def turned(manipulator: Manipulator, direction: Tensor) -> Tensor:
-    """Rotation in which a tool presses along a direction: a box its broadest face; the others keep their start rotation.
+    """Rotation in which a tool presses along a direction: a flat one its broadest face; round ones keep their start rotation.
 
     A plate pressed edge-on into the clay would cut it. A round tool's start rotation says how the scene means it to be held.
 
@@ -36,10 +36,10 @@ def turned(manipulator: Manipulator, direction: Tensor) -> Tensor:
     """
     start = torch.as_tensor(manipulator.rotation_wxyz).to(direction)
     start = _unit(start)
-    if not isinstance(manipulator, ManipulatorBox):
+    if manipulator.thinnest_axis is None:
         return start
     thinnest = torch.zeros_like(direction)
-    thinnest[int(torch.tensor(manipulator.half_extents).argmin())] = 1.0
+    thinnest[manipulator.thinnest_axis] = 1.0
     return multiply(_shortest_turn(rotate(start, thinnest), direction), start)
 
 

@@ -5,17 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cpdeform.core.errors import InputError
 from cpdeform.core.rotation import rotate
-from cpdeform.core.scene import (
-    Manipulator,
-    ManipulatorBox,
-    ManipulatorChopsticks,
-    ManipulatorCylinder,
-    ManipulatorRod,
-    ManipulatorSphere,
-    ManipulatorTorus,
-)
+from cpdeform.core.scene import Manipulator
+from cpdeform.core.shapes.manipulator import shape_of
 from cpdeform.core.signed_distance import local_distance
 
 
@@ -28,24 +20,12 @@ def tool_half_extents(manipulator: Manipulator, quaternion: Tensor) -> Tensor:
 
     Returns:
         Half edges (3,) along the world's axes, length units.
+
+    Raises:
+        InputError: `manipulator` is no tool.
     """
     axes = rotate(quaternion, torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)).T.abs()
-    # A disc's half width along a world axis is its radius times the sine of the angle between that axis and the disc's own.
-    along, across = axes[:, 1], (1.0 - axes[:, 1] ** 2).clamp(min=0.0).sqrt()
-    match manipulator:
-        case ManipulatorSphere():
-            return torch.full_like(along, manipulator.radius)
-        case ManipulatorRod():
-            return along * (0.5 * manipulator.height) + manipulator.radius
-        case ManipulatorChopsticks():
-            return axes @ torch.tensor([0.5 * manipulator.gap, manipulator.height, 0.0]).to(axes) + manipulator.radius
-        case ManipulatorBox():
-            return axes @ torch.tensor(manipulator.half_extents).to(axes) + manipulator.rounding
-        case ManipulatorCylinder():
-            return along * manipulator.half_height + across * manipulator.radius
-        case ManipulatorTorus():
-            return across * manipulator.major_radius + manipulator.tube_radius
-    raise InputError("manipulator", came=type(manipulator).__name__, expected="a manipulator of cpdeform.core.scene")
+    return shape_of(manipulator).half_extents(axes)
 
 
 def surface_points(manipulator: Manipulator, *, resolution: int = 12) -> Tensor:
@@ -62,11 +42,8 @@ def surface_points(manipulator: Manipulator, *, resolution: int = 12) -> Tensor:
     half = 1.1 * tool_half_extents(manipulator, identity)
     lattice = torch.cartesian_prod(*(torch.linspace(-float(edge), float(edge), resolution, dtype=torch.float64) for edge in half))
     # The gradient of a signed distance has length 1, so one step along it lands on the surface, except from medial points.
-    points = lattice.requires_grad_()
-    with torch.enable_grad():
-        distance = local_distance(manipulator, *points.unbind(-1))
-        (gradient,) = torch.autograd.grad(distance.sum(), points)
-    points = (points - distance.unsqueeze(-1) * gradient).detach()
+    distance, gradient = shape_of(manipulator).distance_and_gradient(lattice)
+    points = lattice - distance.unsqueeze(-1) * gradient
     landed = local_distance(manipulator, *points.unbind(-1)).abs() < 1e-9
     return points[landed]
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cpdeform.core.scene import Body, BodyBox, Scene, Vector3
+from cpdeform.core.scene import Body, Scene, Vector3
 from cpdeform.core.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -182,7 +182,7 @@ class Solid:
 
 def body_volume(body: Body) -> float:
     """Volume of a body at the start, cubic length units."""
-    return float(np.prod(body.widths)) if isinstance(body, BodyBox) else 4.0 / 3.0 * np.pi * body.radius**3
+    return body.volume
 
 
 def even_points(count: int, *, skip: int = 0) -> Array:

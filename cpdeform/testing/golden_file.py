@@ -1,7 +1,9 @@
-"""Golden files: rollouts and gradients recorded from PlasticineLab, one ``.npz`` a scene.
+"""Golden files: recorded rollouts and gradients, one ``.npz`` a scene.
 
 A file holds x0, v0, F0, C0 (start), prim (tool states), actions, x, v (end), and total_loss and grad of PlasticineLab's objective
-(nan where not recorded). Its name begins with the scene in PlasticineLab's spelling and a version: ``torus-v2-seed0.npz``.
+(nan where not recorded). Those recorded from PlasticineLab are named by the scene in its spelling and a version
+(``torus-v2-seed0.npz``), and scenes and target grids are files of their own. Those that `cpdeform.testing.record_oracle` makes hold
+the scene (as JSON) and target_grid (G, G, G), too, and have any name.
 """
 
 from __future__ import annotations
@@ -54,7 +56,7 @@ class Golden:
         name: Name of the file without suffix.
         scene: Its scene.
         state: Its start, float64, a single world.
-        arrays: All recorded arrays.
+        arrays: All recorded arrays of numbers.
         target_grid: Node masses (G, G, G) of the target, float64; None where none is at hand.
     """
 
@@ -94,14 +96,19 @@ def read_golden(path: Path, *, scenes: Path | None = None, targets: Path | None 
         InputError: A file is missing, or its content does not fit.
         CapabilityError: The scene holds a manipulator that this version does not know.
     """
-    scene_name, grid_name = _names(path)
-    beside = path.resolve().parent.parent / "plasticinelab"
     try:
         with np.load(path) as file:
-            arrays = {key: file[key].astype(np.float64) for key in file}
-        scene = _scene(scenes or beside / "scenes.json", scene_name, arrays)
-        grid = _target_grid(targets, beside / "target_grids.npz", grid_name, scene)
-        return Golden(path.stem, scene, _start(scene, arrays), arrays, grid)
+            own = str(file["scene"]) if "scene" in file else None
+            arrays = {key: file[key].astype(np.float64) for key in file if key != "scene"}
+        if own is not None:
+            scene = _validated(json.loads(own), path, "scene")
+            grid = torch.as_tensor(arrays["target_grid"]) if "target_grid" in arrays else None
+        else:
+            scene_name, grid_name = _names(path)
+            beside = path.resolve().parent.parent / "plasticinelab"
+            scene = _scene(scenes or beside / "scenes.json", scene_name, arrays)
+            grid = _target_grid(targets, beside / "target_grids.npz", grid_name, scene)
+        return Golden(path.stem, scene, recorded_start(scene, arrays), arrays, grid)
     except OSError as error:
         raise InputError(str(path), came=f"{error}", expected="a golden file with its scene definition") from error
     except KeyError as error:
@@ -129,6 +136,10 @@ def _scene(path: Path, name: str, arrays: dict[str, NDArray[np.float64]]) -> Sce
         "n_grid": ("grid_size", int),
     }
     fields |= {field: kind(arrays[key]) for key, (field, kind) in recorded.items() if key in arrays}
+    return _validated(fields, path, name)
+
+
+def _validated(fields: dict[str, Any], path: Path, name: str) -> Scene:
     try:
         return Scene.model_validate(fields)
     except ValidationError as error:
@@ -149,7 +160,8 @@ def recorded_poses(scene: Scene, recorded: NDArray[np.float64]) -> Tensor:
     return poses
 
 
-def _start(scene: Scene, arrays: dict[str, NDArray[np.float64]]) -> State:
+def recorded_start(scene: Scene, arrays: dict[str, NDArray[np.float64]]) -> State:
+    """Start of a recorded rollout, float64, a single world, from x0, v0, F0, C0 and the first tool states of prim."""
     position, velocity, affine = (torch.as_tensor(arrays[key]).unsqueeze(0) for key in ("x0", "v0", "C0"))
     strain = elastic_strain_from_gradient(torch.as_tensor(arrays["F0"])).unsqueeze(0)
     poses = recorded_poses(scene, arrays["prim"][:1])

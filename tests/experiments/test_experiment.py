@@ -14,11 +14,14 @@ from toy_fixtures import write_toy_distribution, write_toy_task
 from typer.testing import CliRunner
 
 from cpdeform.cli.main import app
+from cpdeform.core.machine import available_cores
 from cpdeform.core.plugins import load_registry
 from cpdeform.experiments.experiment import evaluations_per_stage
 from cpdeform.experiments.experiment_plan import METHODS, TASKS, expand_tasks
 from cpdeform.experiments.experiment_row import ExperimentRow, without_directories
 from cpdeform.experiments.experiment_tables import csv_text, paper_figures, short_table, table_text
+from cpdeform.planning.objectives.mass import mass_grid
+from cpdeform.planning.objectives.metrics import soft_iou
 from cpdeform.run.record import load_record
 
 QUICK = ["--backend", "toy", "--ot", "toy", "--iterations", "3", "--stages", "1"]
@@ -83,10 +86,14 @@ def test_rows_and_records(made):
         assert 0.0 < row["w1_final"] < row["w1_initial"]
         floor = row["w1_floor"]
         assert row["ratio_above_floor"] == pytest.approx((row["w1_final"] - floor) / (row["w1_initial"] - floor))
-        assert 0.0 <= row["incremental_iou"] <= 1.0
+        start, final = record.stages[0].state_before.position[0], record.stages[-1].state.position[0]
+        begin, end, goal = (mass_grid(points.double(), record.task.scene) for points in (start, final, record.target))
+        way = soft_iou(goal, goal) - soft_iou(begin, goal)
+        assert row["incremental_iou"] == pytest.approx(float((soft_iou(end, goal) - soft_iou(begin, goal)) / way), rel=1e-3)
+        assert 0.01 < row["incremental_iou"] < 0.99
         assert row["w1_paper_final"] is None
         assert not row["reused"]
-    assert content["sessions"][0]["machine"]["cores"] >= 1
+    assert content["sessions"][0]["machine"]["cores"] == available_cores()
     assert "4/4  shift, fixed, seed 1: finished" in (made / "stderr.txt").read_text()
 
 

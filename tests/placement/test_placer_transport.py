@@ -70,13 +70,15 @@ def test_score_is_the_papers_formula() -> None:
 def test_no_touching_position_nearby_scores_higher() -> None:
     stage = board(dtype=torch.float64)
     (placement,) = PlacerTransport(distance_scale=1.0).ask(stage)
-    generator = torch.Generator().manual_seed(0)
+    generator, touching = torch.Generator().manual_seed(0), 0
     for _ in range(300):
         pose = placement.pose.clone()
         pose[0, :3] += 0.03 * (torch.rand(3, dtype=torch.float64, generator=generator) - 0.5)
         gap = signed_distance(stage.scene.manipulators[0], pose[0], stage.state.position[0])
         if 0.0 <= float(gap.min()) <= 5e-4:
+            touching += 1
             assert float((stage.priorities / (gap**2 + 1.0)).mean()) <= placement.score + 1e-8
+    assert touching >= 5
 
 
 def test_score_loss_is_the_difference_to_touching_everything() -> None:

@@ -13,6 +13,9 @@ from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, 
 from cpdeform.backends.taichi.kernels_types import build_types
 from cpdeform.backends.taichi.runtime import ti
 
+MANIPULATOR_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+"""The kinds of tools that the functions below know; the simulator refuses others."""
+
 
 @functools.cache
 def build_distance(real: Any) -> SimpleNamespace:

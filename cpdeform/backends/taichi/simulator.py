@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.backends.checkpointing import SimulatorCheckpointing
-from cpdeform.backends.scene_numbers import KIND_NUMBERS
+from cpdeform.backends.taichi.kernels_distance import MANIPULATOR_KINDS
 from cpdeform.backends.taichi.kernels_motion import build_motion
 from cpdeform.backends.taichi.kernels_substep import build_substep
 from cpdeform.backends.taichi.kernels_types import AFFINE, POSITION, RECORD_SIZE, STRAIN, VELOCITY
@@ -73,7 +73,7 @@ class SimulatorTaichi(SimulatorCheckpointing):
         differentiable=True,
         devices=("cpu", "cuda"),
         dtypes=(torch.float32, torch.float64),
-        manipulator_kinds=tuple(KIND_NUMBERS),
+        manipulator_kinds=MANIPULATOR_KINDS,
         deterministic_devices=("cpu",),
     )
 

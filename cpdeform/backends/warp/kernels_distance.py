@@ -14,6 +14,9 @@ import warp as wp
 from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, ROLLING_PIN, SPHERE, TORUS
 from cpdeform.backends.warp.kernels_types import build_types
 
+MANIPULATOR_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+"""The kinds of tools that the functions below know; the simulator refuses others."""
+
 
 @functools.cache
 def build_distance(real: Any) -> SimpleNamespace:

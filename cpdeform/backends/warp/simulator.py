@@ -14,8 +14,8 @@ import warp as wp
 from torch import Tensor
 
 from cpdeform.backends.checkpointing import SimulatorCheckpointing
-from cpdeform.backends.scene_numbers import KIND_NUMBERS
 from cpdeform.backends.warp.graph import Capture, Graphs, Lease, RolloutSlot, SlotKey, SlotPool, capture_on_cuda
+from cpdeform.backends.warp.kernels_distance import MANIPULATOR_KINDS
 from cpdeform.backends.warp.kernels_grid import build_grid
 from cpdeform.backends.warp.kernels_motion import build_motion
 from cpdeform.backends.warp.kernels_transfer import build_transfer
@@ -71,7 +71,7 @@ class SimulatorWarp(SimulatorCheckpointing):
         differentiable=True,
         devices=("cpu", "cuda"),
         dtypes=(torch.float32, torch.float64),
-        manipulator_kinds=tuple(KIND_NUMBERS),
+        manipulator_kinds=MANIPULATOR_KINDS,
         deterministic_devices=("cpu",),
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from cpdeform.core.errors import InputError
 from cpdeform.core.scene import (
     Manipulator,
     ManipulatorBox,
@@ -35,6 +36,9 @@ def distance_and_normal(manipulator: Manipulator, local: Tensor, gap: Tensor) ->
 
     Returns:
         Signed distances (K, 1), negative inside, and outward unit normals (K, 3).
+
+    Raises:
+        InputError: The kind is not one of `MANIPULATOR_KINDS`.
     """
     match manipulator:
         case ManipulatorSphere():
@@ -53,6 +57,7 @@ def distance_and_normal(manipulator: Manipulator, local: Tensor, gap: Tensor) ->
             radial, radius = _radial(local)
             height = local * local.new_tensor([0.0, 1.0, 0.0])
             return _around((radius - manipulator.major_radius) * radial + height, manipulator.tube_radius)
+    raise InputError("manipulator", came=type(manipulator).__name__, expected=f"one of the kinds {', '.join(MANIPULATOR_KINDS)}")
 
 
 def _around(offset: Tensor, radius: float) -> tuple[Tensor, Tensor]:

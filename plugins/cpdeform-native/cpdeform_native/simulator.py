@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.backends.checkpointing import SimulatorCheckpointing
-from cpdeform.backends.scene_numbers import KIND_NUMBERS, material_numbers, scene_numbers, tool_numbers
+from cpdeform.backends.scene_numbers import material_numbers, scene_numbers, tool_numbers
 from cpdeform.core.errors import CapabilityError, InputError, MissingExtraError
 from cpdeform.core.machine import available_cores
 from cpdeform.core.scene import WALL_NODES, Scene
@@ -23,6 +23,9 @@ except ImportError as error:
     raise MissingExtraError(
         "simulator", "native", module="cpdeform_native._simulator", install="pip install cpdeform-native"
     ) from error
+
+MANIPULATOR_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+"""The kinds of tools that the C++ knows."""
 
 
 class SimulatorNative(SimulatorCheckpointing):
@@ -51,7 +54,7 @@ class SimulatorNative(SimulatorCheckpointing):
         differentiable=True,
         devices=("cpu",),
         dtypes=(torch.float32, torch.float64),
-        manipulator_kinds=tuple(KIND_NUMBERS),
+        manipulator_kinds=MANIPULATOR_KINDS,
         deterministic_devices=("cpu",),
     )
 

@@ -1,0 +1,41 @@
+"""The list of all kinds of tools and bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Annotated, Any, get_args
+
+from pydantic import Field
+
+from cpdeform.core.shapes.body import BodyBase
+from cpdeform.core.shapes.box import BodyBox, ManipulatorBox
+from cpdeform.core.shapes.chopsticks import ManipulatorChopsticks
+from cpdeform.core.shapes.cylinder import ManipulatorCylinder
+from cpdeform.core.shapes.manipulator import ManipulatorBase
+from cpdeform.core.shapes.rod import ManipulatorCapsule, ManipulatorRollingPin
+from cpdeform.core.shapes.sphere import BodySphere, ManipulatorSphere
+from cpdeform.core.shapes.torus import ManipulatorTorus
+
+Body = Annotated[BodyBox | BodySphere, Field(discriminator="kind")]
+
+Manipulator = Annotated[
+    ManipulatorSphere
+    | ManipulatorCapsule
+    | ManipulatorBox
+    | ManipulatorCylinder
+    | ManipulatorTorus
+    | ManipulatorRollingPin
+    | ManipulatorChopsticks,
+    Field(discriminator="kind"),
+]
+"""Kernels know a kind by its place in this list, those in C++ too: new kinds go to the end."""
+
+
+def _by_kind(union: Any) -> dict[str, Any]:
+    """The models of a union by the values of their field `kind`, in its order."""
+    return {model.model_fields["kind"].default: model for model in get_args(get_args(union)[0])}
+
+
+BODIES: Mapping[str, type[BodyBase]] = MappingProxyType(_by_kind(Body))
+MANIPULATORS: Mapping[str, type[ManipulatorBase]] = MappingProxyType(_by_kind(Manipulator))
