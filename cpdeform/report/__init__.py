@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from cpdeform.report.pictures import draw_run
+from cpdeform.report.draw import draw_run
 
 __all__ = ["draw_run"]

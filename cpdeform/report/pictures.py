@@ -13,7 +13,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.planning.result import StageResult, Status
 from cpdeform.report.render import Array, Camera, fit_camera, render
 from cpdeform.report.shapes import tool_surface
-from cpdeform.run.record import RunRecord, load_record
+from cpdeform.run.record import RunRecord
 from cpdeform.run.record_files import replacing
 
 AZIMUTH = 28.0
@@ -42,28 +42,12 @@ class View:
     floor: Array
 
 
-def draw_run(directory: Path | str) -> Path:
-    """Draw ``picture.png`` and, where a plan was executed, ``animation.mp4`` from a run record.
-
-    Args:
-        directory: The record; the files are written into it.
-
-    Returns:
-        Path of the picture.
+def draw_picture(record: RunRecord) -> Path:
+    """Draw ``picture.png`` into the record's directory and return its path.
 
     Raises:
-        InputError: There is no record, it is damaged, or no stage is complete.
+        InputError: No stage is complete.
     """
-    from cpdeform.report.animation import draw_animation
-
-    record = load_record(directory)
-    picture = draw_picture(record)
-    draw_animation(record)
-    return picture
-
-
-def draw_picture(record: RunRecord) -> Path:
-    """Draw ``picture.png``; see `draw_run`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
