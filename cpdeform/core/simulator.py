@@ -202,7 +202,8 @@ class _RolloutFunction(torch.autograd.Function):
         """Run the rollout; append its trajectory to `made`, since autograd returns nothing but tensors."""
         trajectory = simulator.rollout(State(*(tensor.detach() for tensor in state)), actions.detach())
         made.append(trajectory)
-        ctx.simulator, ctx.trajectory = simulator, trajectory
+        # what is returned will refer to `ctx`: were `ctx` to refer back, neither would ever be collected, so it gets other tensors
+        ctx.simulator, ctx.trajectory = simulator, _detached(trajectory)
         return trajectory.positions, trajectory.manipulator_poses
 
     @staticmethod
@@ -212,6 +213,18 @@ class _RolloutFunction(torch.autograd.Function):
         start = gradient.initial_state
         state = (start.position, start.velocity, start.affine, start.elastic_strain, start.manipulator_pose)
         return (None, None, gradient.actions, *state)
+
+
+def _detached(trajectory: Trajectory) -> Trajectory:
+    """The same numbers in tensors that know of no autograd graph."""
+    return dataclasses.replace(
+        trajectory,
+        positions=trajectory.positions.detach(),
+        manipulator_poses=trajectory.manipulator_poses.detach(),
+        actions=trajectory.actions.detach(),
+        initial_state=trajectory.initial_state.map(Tensor.detach),
+        final_state=trajectory.final_state.map(Tensor.detach),
+    )
 
 
 def differentiable_rollout(simulator: Simulator, state: State, actions: Tensor) -> Trajectory:
