@@ -46,6 +46,10 @@ class SimulatorCheckpointing(Simulator):
         self.threads = threads or available_cores()
         self.memory_budget = memory_budget
 
+    def _own(self, tensor: Tensor) -> Tensor:
+        """A copy of a tensor on the simulator's device and in its type, which the caller cannot write to."""
+        return tensor.detach().to(device=self.device, dtype=self.dtype, copy=True, memory_format=torch.contiguous_format)
+
     def _check_gradient(self, trajectory: Trajectory, grad_positions: Tensor) -> None:
         """Raise `InputError` unless a trajectory can be gone back and the gradient fits it."""
         if not isinstance(trajectory.checkpoints, tuple):

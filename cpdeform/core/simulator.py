@@ -44,9 +44,10 @@ class Trajectory:
         positions: Particle positions (B, T+1, N, 3) at the start and after each step, length units.
         manipulator_poses: Tool poses (B, T+1, M, 8) at the same times; see `State.manipulator_pose`.
         actions: The actions (B, T, A) that were executed, in [-1, 1].
-        initial_state: State of B worlds before the first step.
+        initial_state: State of B worlds before the first step; a copy of what was given.
         final_state: State of B worlds after the last step.
-        checkpoints: What the backend's `vjp` needs to go back; opaque, owned by the simulator that made it.
+        checkpoints: What the backend's `vjp` needs to go back; opaque, owned by the simulator that made it. It shares no memory
+            with what the caller gave or got, so that the gradient is that of what was rolled out, whatever the caller writes to since.
     """
 
     positions: Tensor
@@ -148,7 +149,7 @@ class Simulator(abc.ABC):
         """Simulate T environment steps.
 
         Args:
-            state: Start of B worlds; not modified.
+            state: Start of B worlds; not modified, and free to be changed afterwards.
             actions: Actions (B, T, A) in [-1, 1], the manipulators' components one after the other.
 
         Returns:

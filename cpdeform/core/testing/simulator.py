@@ -18,9 +18,10 @@ from cpdeform.core.testing.simulator_bench import (
 )
 from cpdeform.core.testing.simulator_contract import CONTRACT_CHECKS
 from cpdeform.core.testing.simulator_gradient import GRADIENT_CHECKS
+from cpdeform.core.testing.simulator_ownership import OWNERSHIP_CHECKS
 from cpdeform.core.testing.simulator_physics import PHYSICS_CHECKS
 
-SIMULATOR_CHECKS = (*CONTRACT_CHECKS, *PHYSICS_CHECKS, *GRADIENT_CHECKS)
+SIMULATOR_CHECKS = (*CONTRACT_CHECKS, *OWNERSHIP_CHECKS, *PHYSICS_CHECKS, *GRADIENT_CHECKS)
 
 
 def check_simulator(

@@ -83,10 +83,10 @@ class SimulatorExample(Simulator):
         return Trajectory(
             positions=torch.stack([each.position for each in states], dim=1),
             manipulator_poses=torch.stack([each.manipulator_pose for each in states], dim=1),
-            actions=actions,
-            initial_state=states[0],
+            actions=actions.clone(),
+            initial_state=states[0].clone(),
             final_state=states[-1],
-            checkpoints=tuple(states[:-1]),
+            checkpoints=(actions, tuple(states[:-1])),
         )
 
     def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
@@ -94,11 +94,11 @@ class SimulatorExample(Simulator):
         _check_gradients(trajectory, grad_positions, grad_manipulators)
         grad_poses = torch.zeros_like(trajectory.manipulator_poses) if grad_manipulators is None else grad_manipulators
         last = trajectory.step_count
-        grad_actions = torch.zeros_like(trajectory.actions)
+        actions, starts = trajectory.checkpoints
+        grad_actions = torch.zeros_like(actions)
         grad = _add(trajectory.final_state.map(torch.zeros_like), grad_positions[:, last], grad_poses[:, last])
         for step in reversed(range(last)):
-            start, action = trajectory.checkpoints[step], trajectory.actions[:, step]
-            grad, grad_actions[:, step] = self._pull_back(start, action, grad)
+            grad, grad_actions[:, step] = self._pull_back(starts[step], actions[:, step], grad)
             grad = _add(grad, grad_positions[:, step], grad_poses[:, step])
         return RolloutGradient(actions=grad_actions, initial_state=grad)
 

@@ -92,6 +92,14 @@ class SimulatorShy(SimulatorWarp):
     capabilities = dataclasses.replace(SimulatorWarp.capabilities, differentiable=False)
 
 
+class SimulatorBorrowing(SimulatorWarp):
+    """Rolls out anew on the way back, from tensors that the caller may have written to since."""
+
+    def vjp(self, trajectory, grad_positions, grad_manipulators=None):
+        again = self.rollout(trajectory.initial_state, trajectory.actions)
+        return super().vjp(again, grad_positions, grad_manipulators)
+
+
 def jitter(trajectory, simulator, _):
     simulator.calls = getattr(simulator, "calls", 0) + 1
     return dataclasses.replace(trajectory, positions=trajectory.positions + 1e-12 * simulator.calls)
@@ -129,6 +137,10 @@ BROKEN_SIMULATORS = {
     "declared manipulator kinds run": SimulatorGhosts,
     "capabilities hold": SimulatorLooseDeclarations,
     "bad arguments are named": SimulatorTerse,
+    "a trajectory is a copy of what was given": changed_rollout(
+        lambda trajectory, _, state: dataclasses.replace(trajectory, initial_state=state)
+    ),
+    "gradient is that of what was rolled out": SimulatorBorrowing,
     "mass and uniform motion are kept": final_with(velocity=lambda velocity: 0.999 * velocity),
     "momentum is kept without forces": final_with(velocity=lambda velocity: 0.999 * velocity),
     "angular momentum is kept without forces": final_with(affine=lambda affine: 0.9 * affine),
