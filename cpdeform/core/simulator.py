@@ -14,6 +14,7 @@ from torch import Tensor
 
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.scene import Scene
+from cpdeform.core.simulator_inputs import check_values
 from cpdeform.core.state import State, initial_state
 
 
@@ -47,7 +48,7 @@ class Trajectory:
         initial_state: State of B worlds before the first step; a copy of what was given.
         final_state: State of B worlds after the last step.
         checkpoints: What the backend's `vjp` needs to go back; opaque, owned by the simulator that made it. It shares no memory
-            with what the caller gave or got, so that the gradient is that of what was rolled out, whatever the caller writes to since.
+            with what the caller gave or got, so that the gradient is that of what was rolled out whatever they write to since.
     """
 
     positions: Tensor
@@ -125,7 +126,10 @@ class Simulator(abc.ABC):
         return initial_state(self.scene, batch_size=batch_size or self.batch_size, device=self.device, dtype=self.dtype)
 
     def check_inputs(self, state: State, actions: Tensor) -> None:
-        """Raise `InputError` unless state and actions fit this simulator; for backends to call first in `rollout`."""
+        """Raise `InputError` unless state and actions fit this simulator; for backends to call first in `rollout`.
+
+        Shapes must be the scene's, and numbers finite and sensible, see `check_values`: what backends would make of others differs.
+        """
         expected = (state.batch_size, "T", self.scene.action_size)
         if actions.ndim != 3 or actions.shape[0] != state.batch_size or actions.shape[2] != self.scene.action_size:
             raise InputError("actions", came=f"shape {tuple(actions.shape)}", expected=f"shape {expected}")
@@ -143,6 +147,7 @@ class Simulator(abc.ABC):
         if state.manipulator_pose.shape[1] != len(self.scene.manipulators):
             count = state.manipulator_pose.shape[1]
             raise InputError("state", came=f"{count} manipulators", expected=f"{len(self.scene.manipulators)} manipulators")
+        check_values(self.scene, state, actions)
 
     @abc.abstractmethod
     def rollout(self, state: State, actions: Tensor) -> Trajectory:
@@ -156,7 +161,8 @@ class Simulator(abc.ABC):
             The trajectory, with the checkpoints that `vjp` needs.
 
         Raises:
-            InputError: Shapes do not fit the scene.
+            InputError: Shapes do not fit the scene, or numbers are not finite or make no sense. A rollout from sensible ones may
+                still end in numbers that are not finite.
         """
 
     @abc.abstractmethod
