@@ -161,17 +161,23 @@ class SimulatorTaichi(SimulatorCheckpointing):
                 records.append(record)
         return (tuple(records) if keep else None), particles
 
-    def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
+    def vjp(
+        self,
+        trajectory: Trajectory,
+        grad_positions: Tensor,
+        grad_manipulators: Tensor | None = None,
+        *,
+        grad_final_state: State | None = None,
+    ) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
-        self._check_gradient(trajectory, grad_positions)
+        positions, poses, final = self._incoming(trajectory, grad_positions, grad_manipulators, grad_final_state)
         (kept,) = trajectory.checkpoints
         state, actions = trajectory.initial_state, kept.actions
-        grad_positions = grad_positions.detach().to(device=self.device, dtype=self.dtype)
         with self._stream():
-            gradient, grad_poses = self._pull_back_particles(kept, grad_positions)
-            if grad_manipulators is not None:
+            gradient, grad_poses = self._pull_back_particles(kept, positions, final)
+            if poses is not None:
                 tools = state.manipulator_pose.shape[1]
-                grad_poses[:, :: self.scene.substeps, :tools] += grad_manipulators.to(grad_poses)
+                grad_poses[:, :: self.scene.substeps, :tools] += poses
             grad_start, grad_actions = torch.zeros_like(state.manipulator_pose), torch.zeros_like(actions)
             if tools := state.manipulator_pose.shape[1]:
                 inputs = (actions, self._program.tools, self.scene.substeps, tools, kept.poses)
@@ -181,15 +187,15 @@ class SimulatorTaichi(SimulatorCheckpointing):
         start.elastic_strain[..., 3:] *= 2.0
         return RolloutGradient(actions=grad_actions, initial_state=start)
 
-    def _pull_back_particles(self, kept: _Checkpoints, grad_positions: Tensor) -> tuple[Tensor, Tensor]:
+    def _pull_back_particles(self, kept: _Checkpoints, grad_positions: Tensor, final: State | None) -> tuple[Tensor, Tensor]:
         """Gradients with respect to the particles (W N, 21) at the start and the poses (W, frames, M, 8)."""
         worlds, frames, tools = kept.poses.shape[:3]
         stepper = Stepper(self._program, worlds=worlds, threads=self.threads)
-        gradient = torch.zeros_like(kept.starts[0])
+        gradient = torch.zeros_like(kept.starts[0]) if final is None else _records(final)
         grad_poses = torch.zeros(stepper.rows * worlds, frames, tools, 8, dtype=self.dtype, device=self.device)
         position = gradient.view(worlds, -1, RECORD_SIZE)[..., :VELOCITY]
         steps = len(kept.starts)
-        position += grad_positions[:, steps]
+        position.copy_(grad_positions[:, steps])
         for step in reversed(range(steps)):
             records = kept.substeps[step]
             if records is None:

@@ -279,23 +279,33 @@ class SimulatorWarp(SimulatorCheckpointing):
                 records.append(record)
         return (tuple(records) if keep else None), particles
 
-    def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
+    def vjp(
+        self,
+        trajectory: Trajectory,
+        grad_positions: Tensor,
+        grad_manipulators: Tensor | None = None,
+        *,
+        grad_final_state: State | None = None,
+    ) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
-        self._check_gradient(trajectory, grad_positions)
-        grad_positions = grad_positions.detach().to(device=self.device, dtype=self.dtype)
-        grad_poses = None if grad_manipulators is None else grad_manipulators.detach()
+        positions, poses, final = self._incoming(trajectory, grad_positions, grad_manipulators, grad_final_state)
         lease = trajectory.checkpoints[0]
         if self._slots is None or not isinstance(lease, Lease):
-            return self._vjp_lanes(trajectory, grad_positions, grad_poses)
+            return self._vjp_lanes(trajectory, positions, poses, final)
         slot: RolloutSlot = lease.slot
         with self._stream():
-            return self._slots.with_memory(lambda: slot.vjp(grad_positions, grad_poses))
+            return self._slots.with_memory(lambda: slot.vjp(positions, poses, final))
 
-    def _vjp_lanes(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None) -> RolloutGradient:
+    def _vjp_lanes(
+        self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None, final: State | None
+    ) -> RolloutGradient:
         """Launch a vjp kernel by kernel."""
         (kept,) = trajectory.checkpoints
         state = trajectory.initial_state
         gradient = state.map(torch.zeros_like)
+        if final is not None:
+            last = {name: getattr(final, name) for name in ("velocity", "affine", "elastic_strain")}
+            gradient = dataclasses.replace(gradient, **last)
         lanes = self._lanes(state.batch_size)
         with self._stream():
             parts = self._over_lanes(
@@ -381,8 +391,8 @@ class SimulatorWarp(SimulatorCheckpointing):
         # snapshots and the caller's gradient of them; initial state, twice where the checkpoints hold it, too; final state, a
         # gradient, and what a substep makes
         common = 2 * snapshots + (4 if self._slots is not None else 5) * particles
-        if self._slots is not None:  # a slot has the gradient of the snapshots, the end and its gradient for itself once more
-            common += snapshots + 2 * particles
+        if self._slots is not None:  # a slot has the gradients of the snapshots and of the end, the end and its gradient once more
+            common += snapshots + 3 * particles
         return history + work + worlds * common
 
 

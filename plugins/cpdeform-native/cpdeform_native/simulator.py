@@ -122,24 +122,29 @@ class SimulatorNative(SimulatorCheckpointing):
             checkpoints=(checkpoints, actions),
         )
 
-    def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
+    def vjp(
+        self,
+        trajectory: Trajectory,
+        grad_positions: Tensor,
+        grad_manipulators: Tensor | None = None,
+        *,
+        grad_final_state: State | None = None,
+    ) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
-        self._check_gradient(trajectory, grad_positions)
+        positions, poses, final = self._incoming(trajectory, grad_positions, grad_manipulators, grad_final_state)
         checkpoints, actions = trajectory.checkpoints
         if not self._engine.made(checkpoints):
             raise InputError("trajectory", came="one made by another simulator", expected="one made by this simulator's rollout")
         gradient = trajectory.initial_state.map(torch.empty_like)
         grad_actions = torch.zeros(actions.shape, dtype=torch.float64)
         grad_pose = torch.empty(gradient.manipulator_pose.shape, dtype=torch.float64)
-        grad_positions = grad_positions.detach().to(device=self.device, dtype=self.dtype).contiguous()
-        poses = None
-        if grad_manipulators is not None:
-            poses = grad_manipulators.detach().to(device=self.device, dtype=self.dtype).contiguous().numpy()
+        last = (None, None, None) if final is None else _arrays(final.velocity, final.affine, final.elastic_strain)
         self._engine.vjp(
             checkpoints,
             actions.numpy(),
-            grad_positions.numpy(),
-            poses,
+            positions.contiguous().numpy(),
+            None if poses is None else poses.contiguous().numpy(),
+            *last,
             *_arrays(grad_actions, gradient.position, gradient.velocity, gradient.affine, gradient.elastic_strain, grad_pose),
         )
         start = dataclasses.replace(gradient, manipulator_pose=grad_pose.to(self.dtype))

@@ -103,9 +103,26 @@ class SimulatorShy(SimulatorWarp):
 class SimulatorBorrowing(SimulatorWarp):
     """Rolls out anew on the way back, from tensors that the caller may have written to since."""
 
-    def vjp(self, trajectory, grad_positions, grad_manipulators=None):
+    def vjp(self, trajectory, grad_positions, grad_manipulators=None, **options):
         again = self.rollout(trajectory.initial_state, trajectory.actions)
-        return super().vjp(again, grad_positions, grad_manipulators)
+        return super().vjp(again, grad_positions, grad_manipulators, **options)
+
+
+class SimulatorOneWay(SimulatorWarp):
+    """Written before rollouts could be chained."""
+
+    def vjp(self, trajectory, grad_positions, grad_manipulators=None):
+        return super().vjp(trajectory, grad_positions, grad_manipulators)
+
+
+class SimulatorMatrixStrain(SimulatorWarp):
+    """Takes the gradient of the final strain as that of the matrix's entries, and gives that of the six numbers."""
+
+    def vjp(self, trajectory, grad_positions, grad_manipulators=None, *, grad_final_state=None):
+        if grad_final_state is not None:
+            strain = grad_final_state.elastic_strain * torch.tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+            grad_final_state = dataclasses.replace(grad_final_state, elastic_strain=strain)
+        return super().vjp(trajectory, grad_positions, grad_manipulators, grad_final_state=grad_final_state)
 
 
 def jitter(trajectory, simulator, _):
@@ -167,6 +184,8 @@ BROKEN_SIMULATORS = {
     "gradient of a batch is a loop over worlds": changed_gradient(mixed_gradients),
     "gradient is finite from rest": changed_gradient(infinite_without_actions),
     "gradient is refused where not declared": SimulatorShy,
+    "gradient of the final state": SimulatorOneWay,
+    "gradient of 2T steps is that of T steps twice": SimulatorMatrixStrain,
 }
 
 
