@@ -10,6 +10,7 @@ References:
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 
@@ -18,6 +19,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import CapabilityError, InputError
+from cpdeform.core.final_gradient import state_tensors
 from cpdeform.core.metrics import evaluate_metric
 from cpdeform.core.objective import Objective
 from cpdeform.core.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
@@ -203,9 +205,10 @@ class Planner:
         trajectory, loss = None, loss_before
         if status is Status.FINISHED and best is not None:
             trajectory, loss = self._execute(state, candidates[best])
-            # A warm-started loss may flatter its plan.
+            # A warm-started loss may flatter its plan, and sums in another order may make a rollout at the brink break.
             if not loss < loss_before:
-                trajectory, loss, status = None, loss_before, Status.NO_IMPROVEMENT
+                status = Status.NO_IMPROVEMENT if math.isfinite(loss) else Status.NON_FINITE
+                trajectory, loss = None, loss_before
         clock.lap("execution")
         if trajectory is not None and best is not None and self.refinement is not None:
             refined = self._refine(self.refinement, index, state, candidates[best], loss_before)
@@ -282,9 +285,16 @@ class Planner:
         return notify
 
     def _execute(self, state: State, candidate: PlacementResult) -> tuple[Trajectory, float]:
-        """Run the chosen plan once more, as a single world, and take its loss by a fresh (not warm-started) evaluation."""
+        """Run the chosen plan once more, as a single world, and take its loss by a fresh (not warm-started) evaluation.
+
+        The loss is infinite where the rollout leaves the finite numbers, if only in a velocity or strain at its end: neither can an
+        objective be asked about it nor a stage begin there.
+        """
         start = state.with_manipulators(candidate.placement.pose.unsqueeze(0))
         trajectory = self.simulator.rollout(start, candidate.actions.unsqueeze(0))
+        tensors = (trajectory.positions, trajectory.manipulator_poses, *state_tensors(trajectory.final_state))
+        if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors):
+            return trajectory, math.inf
         return trajectory, float(self.objective.begin(trajectory).loss[0])
 
 

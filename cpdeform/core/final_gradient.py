@@ -91,9 +91,9 @@ def pull_back(
         return simulator.vjp(trajectory, *add_final_gradient(trajectory, grad_positions, grad_manipulators, position, pose))
     if not takes_final_gradient(simulator):
         raise CapabilityError(
-            f"{type(simulator).__name__} has no gradient with respect to the final velocity, affine field and strain: its vjp takes "
-            "no grad_final_state. Choose another backend, add the argument (see Simulator.vjp), or detach the state from which you "
-            "go on: trajectory.final_state.clone()."
+            f"{type(simulator).__name__} has no gradient with respect to the final velocity, affine field and strain: its vjp "
+            "takes no grad_final_state. Choose another backend, add the argument (see Simulator.vjp), or detach the state that "
+            "you go on from: trajectory.final_state.clone()."
         )
     pairs = zip(grad_final, state_tensors(trajectory.final_state), strict=True)
     final = State(*(torch.zeros_like(like) if grad is None else grad for grad, like in pairs))
