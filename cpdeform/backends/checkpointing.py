@@ -6,9 +6,11 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.final_gradient import add_final_gradient, check_final_gradient
 from cpdeform.core.machine import available_cores
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import Simulator, Trajectory
+from cpdeform.core.state import State
 
 
 class SimulatorCheckpointing(Simulator):
@@ -45,6 +47,36 @@ class SimulatorCheckpointing(Simulator):
             raise InputError("memory_budget", came=str(memory_budget), expected="a number of bytes, 0 or more")
         self.threads = threads or available_cores()
         self.memory_budget = memory_budget
+
+    def _own(self, tensor: Tensor) -> Tensor:
+        """A copy of a tensor on the simulator's device and in its type, which the caller cannot write to."""
+        return tensor.detach().to(device=self.device, dtype=self.dtype, copy=True, memory_format=torch.contiguous_format)
+
+    def _incoming(
+        self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None, grad_final_state: State | None
+    ) -> tuple[Tensor, Tensor | None, State | None]:
+        """What `vjp` was given, on the simulator's device and in its type.
+
+        Returns:
+            Gradients with respect to positions (B, T+1, N, 3) and poses (B, T+1, M, 8), with what the final state adds to them; and
+            that with respect to the final state, of which velocity, affine field and strain are left to be looked at. There an
+            off-diagonal strain stands for one of its two matrix entries, as in the kernels.
+
+        Raises:
+            InputError: They do not fit the trajectory, or it cannot be gone back.
+        """
+        self._check_gradient(trajectory, grad_positions)
+        if grad_manipulators is not None and grad_manipulators.shape != trajectory.manipulator_poses.shape:
+            came, expected = (f"shape {tuple(like.shape)}" for like in (grad_manipulators, trajectory.manipulator_poses))
+            raise InputError("grad_manipulators", came=came, expected=expected)
+        check_final_gradient(trajectory, grad_final_state)
+        positions = grad_positions.detach().to(device=self.device, dtype=self.dtype)
+        poses = None if grad_manipulators is None else grad_manipulators.detach().to(device=self.device, dtype=self.dtype)
+        if grad_final_state is None:
+            return positions, poses, None
+        final = grad_final_state.map(self._own)
+        final.elastic_strain[..., 3:] *= 0.5
+        return *add_final_gradient(trajectory, positions, poses, final.position, final.manipulator_pose), final
 
     def _check_gradient(self, trajectory: Trajectory, grad_positions: Tensor) -> None:
         """Raise `InputError` unless a trajectory can be gone back and the gradient fits it."""

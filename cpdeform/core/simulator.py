@@ -11,9 +11,12 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from cpdeform.core.errors import CapabilityError, InputError
+from cpdeform.core.final_gradient import pull_back, state_tensors
 from cpdeform.core.scene import Scene
+from cpdeform.core.simulator_inputs import check_values
 from cpdeform.core.state import State, initial_state
 
 
@@ -44,9 +47,10 @@ class Trajectory:
         positions: Particle positions (B, T+1, N, 3) at the start and after each step, length units.
         manipulator_poses: Tool poses (B, T+1, M, 8) at the same times; see `State.manipulator_pose`.
         actions: The actions (B, T, A) that were executed, in [-1, 1].
-        initial_state: State of B worlds before the first step.
+        initial_state: State of B worlds before the first step; a copy of what was given.
         final_state: State of B worlds after the last step.
-        checkpoints: What the backend's `vjp` needs to go back; opaque, owned by the simulator that made it.
+        checkpoints: What the backend's `vjp` needs to go back; opaque, owned by the simulator that made it. It shares no memory
+            with what the caller gave or got, so that the gradient is that of what was rolled out whatever they write to since.
     """
 
     positions: Tensor
@@ -124,7 +128,10 @@ class Simulator(abc.ABC):
         return initial_state(self.scene, batch_size=batch_size or self.batch_size, device=self.device, dtype=self.dtype)
 
     def check_inputs(self, state: State, actions: Tensor) -> None:
-        """Raise `InputError` unless state and actions fit this simulator; for backends to call first in `rollout`."""
+        """Raise `InputError` unless state and actions fit this simulator; for backends to call first in `rollout`.
+
+        Shapes must be the scene's, and numbers finite and sensible, see `check_values`: what backends would make of others differs.
+        """
         expected = (state.batch_size, "T", self.scene.action_size)
         if actions.ndim != 3 or actions.shape[0] != state.batch_size or actions.shape[2] != self.scene.action_size:
             raise InputError("actions", came=f"shape {tuple(actions.shape)}", expected=f"shape {expected}")
@@ -142,36 +149,49 @@ class Simulator(abc.ABC):
         if state.manipulator_pose.shape[1] != len(self.scene.manipulators):
             count = state.manipulator_pose.shape[1]
             raise InputError("state", came=f"{count} manipulators", expected=f"{len(self.scene.manipulators)} manipulators")
+        check_values(self.scene, state, actions)
 
     @abc.abstractmethod
     def rollout(self, state: State, actions: Tensor) -> Trajectory:
         """Simulate T environment steps.
 
         Args:
-            state: Start of B worlds; not modified.
+            state: Start of B worlds; not modified, and free to be changed afterwards.
             actions: Actions (B, T, A) in [-1, 1], the manipulators' components one after the other.
 
         Returns:
             The trajectory, with the checkpoints that `vjp` needs.
 
         Raises:
-            InputError: Shapes do not fit the scene.
+            InputError: Shapes do not fit the scene, or numbers are not finite or make no sense. A rollout from sensible ones may
+                still end in numbers that are not finite.
         """
 
     @abc.abstractmethod
-    def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
+    def vjp(
+        self,
+        trajectory: Trajectory,
+        grad_positions: Tensor,
+        grad_manipulators: Tensor | None = None,
+        *,
+        grad_final_state: State | None = None,
+    ) -> RolloutGradient:
         """Pull gradients back through a rollout.
 
         Args:
             trajectory: Made by this simulator's `rollout`.
             grad_positions: Gradient (B, T+1, N, 3) of a scalar with respect to `trajectory.positions`.
-            grad_manipulators: Gradient (B, T+1, M, 8) with respect to `trajectory.manipulator_poses`; zero where absent.
+            grad_manipulators: Gradient (B, T+1, M, 8) with respect to `trajectory.manipulator_poses`; defaults to zero.
+            grad_final_state: Gradient with respect to every tensor of `trajectory.final_state`, in its shapes; defaults to zero.
+                Those of positions and tools add to what the other two say about the last step. The entries for the off-diagonal
+                `elastic_strain` numbers are as in `RolloutGradient.initial_state`, which is what the rollout after this one gives.
 
         Returns:
             The gradient with respect to the actions and the initial state.
 
         Raises:
             CapabilityError: The backend is not differentiable.
+            InputError: The shapes do not fit the trajectory, or another simulator made it.
         """
 
     @abc.abstractmethod
@@ -198,24 +218,43 @@ class _RolloutFunction(torch.autograd.Function):
     """Bridge from a simulator's rollout and vjp to autograd."""
 
     @staticmethod
-    def forward(ctx: Any, simulator: Simulator, made: list[Trajectory], actions: Tensor, *state: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, simulator: Simulator, made: list[Trajectory], actions: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """Run the rollout; append its trajectory to `made`, since autograd returns nothing but tensors."""
         trajectory = simulator.rollout(State(*(tensor.detach() for tensor in state)), actions.detach())
         made.append(trajectory)
-        ctx.simulator, ctx.trajectory = simulator, trajectory
-        return trajectory.positions, trajectory.manipulator_poses
+        # what is returned will refer to `ctx`: were `ctx` to refer back, neither would ever be collected, so it gets other tensors
+        ctx.simulator, ctx.trajectory = simulator, _detached(trajectory)
+        ctx.set_materialize_grads(False)
+        return trajectory.positions, trajectory.manipulator_poses, *state_tensors(trajectory.final_state)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        """Pull the gradients back through the simulator."""
-        gradient = ctx.simulator.vjp(ctx.trajectory, grads[0], grads[1])
-        start = gradient.initial_state
-        state = (start.position, start.velocity, start.affine, start.elastic_strain, start.manipulator_pose)
-        return (None, None, gradient.actions, *state)
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Pull the gradients back through the simulator; those of outputs that nothing depends on are None."""
+        gradient = pull_back(ctx.simulator, ctx.trajectory, grads[0], grads[1], grads[2:])
+        return (None, None, gradient.actions, *state_tensors(gradient.initial_state))
+
+
+def _detached(trajectory: Trajectory) -> Trajectory:
+    """The same numbers in tensors that know of no autograd graph."""
+    return dataclasses.replace(
+        trajectory,
+        positions=trajectory.positions.detach(),
+        manipulator_poses=trajectory.manipulator_poses.detach(),
+        actions=trajectory.actions.detach(),
+        initial_state=trajectory.initial_state.map(Tensor.detach),
+        final_state=trajectory.final_state.map(Tensor.detach),
+    )
 
 
 def differentiable_rollout(simulator: Simulator, state: State, actions: Tensor) -> Trajectory:
-    """Run a rollout whose positions and manipulator poses carry gradients to the actions and the initial state.
+    """Run a rollout that carries gradients to the actions and the initial state.
+
+    A closed loop is a chain of these, one step each::
+
+        for _ in range(steps):
+            trajectory = differentiable_rollout(simulator, state, policy(state).unsqueeze(1))
+            state = trajectory.final_state
 
     Args:
         simulator: Any differentiable backend.
@@ -223,15 +262,15 @@ def differentiable_rollout(simulator: Simulator, state: State, actions: Tensor) 
         actions: Actions (B, T, A) in [-1, 1].
 
     Returns:
-        A trajectory whose `positions` (B, T+1, N, 3) and `manipulator_poses` (B, T+1, M, 8) are part of the autograd graph.
-        Its `final_state` holds velocities and strains without gradient.
+        A trajectory whose `positions` (B, T+1, N, 3), `manipulator_poses` (B, T+1, M, 8) and `final_state`, with all its tensors,
+        are part of the autograd graph. It can be differentiated once.
 
     Raises:
-        CapabilityError: The simulator is not differentiable.
+        CapabilityError: The simulator is not differentiable. Or, in `backward`, its `vjp` takes no gradient of the final state, and
+            that is needed.
     """
     if not simulator.capabilities.differentiable:
         raise CapabilityError(f"{type(simulator).__name__} is not differentiable; choose a backend that is.")
-    tensors = (state.position, state.velocity, state.affine, state.elastic_strain, state.manipulator_pose)
     made: list[Trajectory] = []
-    positions, poses = _RolloutFunction.apply(simulator, made, actions, *tensors)  # type: ignore[no-untyped-call]
-    return dataclasses.replace(made[0], positions=positions, manipulator_poses=poses)
+    positions, poses, *final = _RolloutFunction.apply(simulator, made, actions, *state_tensors(state))  # type: ignore[no-untyped-call]
+    return dataclasses.replace(made[0], positions=positions, manipulator_poses=poses, final_state=State(*final))

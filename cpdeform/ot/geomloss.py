@@ -137,11 +137,12 @@ class OTSolverGeomLoss(OTSolver):
 
     def _start(self, problem: Problem) -> tuple[Tensor, Tensor]:
         """GeomLoss's annealed, debiased potentials at the temperature of `problem`."""
-        exponent = self.exponent
+        exponent, blur = self.exponent, problem.epsilon ** (1 / self.exponent)
         loss = SamplesLoss(
             loss="sinkhorn",
             p=exponent,
-            blur=problem.epsilon ** (1 / exponent),
+            blur=blur,
+            diameter=_given_diameter(problem, blur),
             scaling=self.scaling,
             debias=True,
             potentials=True,
@@ -181,6 +182,7 @@ class OTSolverGeomLoss(OTSolver):
             loss="sinkhorn",
             p=1,
             blur=self.blur,
+            diameter=_given_diameter(problem, self.blur),
             scaling=self.scaling,
             debias=self.debias,
             potentials=True,
@@ -192,6 +194,11 @@ class OTSolverGeomLoss(OTSolver):
             value = (source.weights * f).sum() + (target.weights * g).sum()
             (gradient,) = torch.autograd.grad(value, points)
         return f.detach(), g.detach(), gradient
+
+
+def _given_diameter(problem: Problem, blur: float) -> float | None:
+    """What GeomLoss is to take as the diameter of points that are all one, of whose zero it takes the logarithm; else its own."""
+    return None if problem.diameter() > 0.0 else blur
 
 
 def _descent(problem: Problem, f: Tensor, g: Tensor, tolerance: float, limit: int) -> tuple[Tensor, Tensor, int]:

@@ -26,7 +26,11 @@ _CHUNK_GPU = 1 << 24
 
 
 def geomloss_blurs(diameter: float, blur: float, scaling: float) -> list[float]:
-    """GeomLoss's temperatures for p = 1, length units: the diameter twice, then falling by `scaling`, then the blur."""
+    """GeomLoss's temperatures for p = 1, length units: the diameter twice, then falling by `scaling`, then the blur.
+
+    Points that are all one, with a diameter of zero, have the blur for it.
+    """
+    diameter = diameter or blur
     between = np.arange(np.log(diameter), np.log(blur), np.log(scaling))  # so that rounding gives as many as it does there
     return [diameter, *(float(value) for value in np.exp(between)), blur]
 

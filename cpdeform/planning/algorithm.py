@@ -31,7 +31,7 @@ from cpdeform.planning.optimizer import Iteration
 from cpdeform.planning.phases.phase import Phase
 from cpdeform.planning.result import DeformResult, Observer, StageResult, Status
 from cpdeform.planning.still import still_trajectory
-from cpdeform.planning.workbench import Workbench
+from cpdeform.planning.workbench import Workbench, is_finite
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -201,7 +201,7 @@ class Planner:
         trajectory = self.simulator.rollout(
             before.with_manipulators(candidate.proposal.pose.unsqueeze(0)), candidate.actions.unsqueeze(0).to(before.position)
         )
-        if not bool(torch.isfinite(trajectory.positions).all()):
+        if not is_finite(trajectory):
             return None
         found = self.objective.evaluate(trajectory)
         if not float(found.loss[0]) < result.loss_before:
@@ -263,7 +263,7 @@ class Planner:
         trajectory, loss, warm = bench.execute(candidate)
         if not np.isfinite(loss):
             return Status.NON_FINITE
-        # A warm-started loss may flatter its plan.
+        # A warm-started loss may flatter its plan, and sums in another order may make a rollout at the brink break.
         if not phase.accepts(loss, loss_before=bench.stage.loss, loss_now=execution.loss):
             return Status.NO_IMPROVEMENT
         execution.trajectory, execution.loss, execution.warm = trajectory, loss, warm

@@ -39,8 +39,8 @@ _ADVICE = {
         "Check the tools' bounds and size, or use --placer fixed."
     ),
     Status.NON_FINITE: (
-        "Every plan's simulation left the finite numbers before it lowered the loss. Lower the action scale, the stiffness or "
-        "the time step of the scene."
+        "Every plan's simulation left the finite numbers before it lowered the loss, or the best one did when it was executed. "
+        "Lower the action scale, the stiffness or the time step of the scene."
     ),
 }
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from cpdeform.core.final_gradient import state_tensors
 from cpdeform.core.objective import Objective
 from cpdeform.core.placer import Candidate, Stage
 from cpdeform.core.simulator import Simulator, Trajectory
@@ -154,12 +155,13 @@ class Workbench:
         """Run a plan once more, as a single world, and take its loss by a fresh (not warm-started) evaluation.
 
         Returns:
-            The trajectory, its loss (nan where the rollout is not finite), and what the objective can start from at its end.
+            The trajectory, its loss, and what the objective can start from at its end. The loss is nan where the rollout leaves
+            the finite numbers, if only in a velocity or strain at its end: no stage can begin there.
         """
         start = self.stage.state.with_manipulators(candidate.proposal.pose.unsqueeze(0))
         trajectory = self.simulator.rollout(start, candidate.actions.unsqueeze(0).to(start.position))
         self.rollouts += 1
-        if not bool(torch.isfinite(trajectory.positions).all()):
+        if not is_finite(trajectory):
             return trajectory, float("nan"), None
         result = self.objective.evaluate(trajectory)
         return trajectory, float(result.loss[0]), result.warm
@@ -172,3 +174,9 @@ class Workbench:
     def _announce(self, worlds: int) -> None:
         room = min(worlds, self.simulator.batch_size)
         self.on_batch(room, self.simulator.memory_estimate(self.task.rollout_steps, worlds=room))
+
+
+def is_finite(trajectory: Trajectory) -> bool:
+    """Whether a trajectory and all of its final state are finite."""
+    tensors = (trajectory.positions, trajectory.manipulator_poses, *state_tensors(trajectory.final_state))
+    return all(bool(torch.isfinite(tensor).all()) for tensor in tensors)

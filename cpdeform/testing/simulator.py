@@ -16,11 +16,13 @@ from cpdeform.testing.simulator_bench import (
     default_scene,
     resting,
 )
+from cpdeform.testing.simulator_chain import CHAIN_CHECKS
 from cpdeform.testing.simulator_contract import CONTRACT_CHECKS
 from cpdeform.testing.simulator_gradient import GRADIENT_CHECKS
+from cpdeform.testing.simulator_ownership import OWNERSHIP_CHECKS
 from cpdeform.testing.simulator_physics import PHYSICS_CHECKS
 
-SIMULATOR_CHECKS = (*CONTRACT_CHECKS, *PHYSICS_CHECKS, *GRADIENT_CHECKS)
+SIMULATOR_CHECKS = (*CONTRACT_CHECKS, *OWNERSHIP_CHECKS, *PHYSICS_CHECKS, *GRADIENT_CHECKS, *CHAIN_CHECKS)
 
 
 def check_simulator(

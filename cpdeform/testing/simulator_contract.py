@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -266,6 +267,36 @@ def check_errors(bench: SimulatorBench) -> Finding:
     return violations(complaints)
 
 
+def check_values_refused(bench: SimulatorBench) -> Finding:
+    """Numbers that are not finite or make no sense raise `InputError` with the name of the tensor."""
+    simulator = bench.make(default_scene(bench.capabilities.manipulator_kinds[:1]))
+    state, actions = simulator.initial_state(), no_actions(simulator)
+    cases = {f"nan in {name}": _spoilt(state, name, torch.nan) for name in ("position", "velocity", "affine", "elastic_strain")}
+    cases |= {"an infinite velocity": _spoilt(state, "velocity", torch.inf), "a position of 1e6": _spoilt(state, "position", 1e6)}
+    complaints = []
+    if len(simulator.scene.manipulators):
+        nothing = dataclasses.replace(state, manipulator_pose=state.manipulator_pose.clone())
+        nothing.manipulator_pose[..., 3:7] = 0.0
+        cases |= {"nan in a quaternion": _spoilt(state, "manipulator_pose", torch.nan, 5), "a quaternion of zeros": nothing}
+        cases |= {"a tool at 1e6": _spoilt(state, "manipulator_pose", 1e6, 1)}
+    for what, start in cases.items():
+        call: Callable[[], object] = lambda start=start: simulator.rollout(start, actions)  # type: ignore[misc]  # noqa: E731
+        complaints += complaint_unless_raised(call, InputError, words=["state."], what=what)
+    for value in (torch.nan, 50.0, -1.5) if simulator.scene.action_size else ():
+        plan = actions.clone()
+        plan[0, -1, 0] = value
+        call = lambda plan=plan: simulator.rollout(state, plan)  # type: ignore[misc]  # noqa: E731
+        complaints += complaint_unless_raised(call, InputError, words=["actions"], what=f"an action of {value:g}")
+    return violations(complaints)
+
+
+def _spoilt(state: State, name: str, value: float, component: int = 0) -> State:
+    """The state with another number in one place."""
+    tensor = getattr(state, name).clone()
+    tensor[0, -1].view(-1)[component] = value
+    return dataclasses.replace(state, **{name: tensor})
+
+
 CONTRACT_CHECKS: tuple[CheckItem[SimulatorBench], ...] = (
     CheckItem("shapes and types of the trajectory", check_shapes, "See the attributes of Trajectory and State."),
     CheckItem("state and actions are not modified", check_inputs_untouched, "Copy the inputs before writing to them."),
@@ -295,4 +326,5 @@ CONTRACT_CHECKS: tuple[CheckItem[SimulatorBench], ...] = (
         "Call Simulator.__init__, which compares with the declared capabilities; correct those.",
     ),
     CheckItem("bad arguments are named", check_errors, "Call Simulator.check_inputs first in rollout; raise InputError in vjp."),
+    CheckItem("senseless numbers are refused", check_values_refused, "Call Simulator.check_inputs first in rollout."),
 )

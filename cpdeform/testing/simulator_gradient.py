@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cpdeform.core.errors import CapabilityError
 from cpdeform.core.scene import Scene
-from cpdeform.core.simulator import RolloutGradient, Simulator
+from cpdeform.core.simulator import RolloutGradient, Simulator, Trajectory
 from cpdeform.core.state import State
 from cpdeform.testing.report import CheckItem, Finding, Skip, complaint_unless_raised, violations, worst
 from cpdeform.testing.simulator_bench import (
@@ -41,29 +41,38 @@ DOUBLE_BOUND, SINGLE_BOUND = 2e-4, 0.5
 as large for n numbers, so that the wide bound of single precision still sees a gradient that is too long by a percent or so."""
 
 
-class _Probe:
+class Probe:
     """A rollout of two worlds, a random linear loss on it, and the gradient that the simulator finds."""
+
+    steps = 2
 
     def __init__(self, bench: SimulatorBench, scene: Scene) -> None:
         self.bench = bench
         self.simulator: Simulator = bench.make(scene, batch_size=2)
-        self.state, self.actions = stirred(self.simulator, batch_size=2), random_actions(self.simulator, batch_size=2)
+        self.state, self.actions = (
+            stirred(self.simulator, batch_size=2),
+            random_actions(self.simulator, batch_size=2, steps=self.steps),
+        )
         trajectory = self.simulator.rollout(self.state, self.actions)
         self.generator = torch.Generator().manual_seed(2)
-        self.base = trajectory.positions.double(), trajectory.manipulator_poses.double()
-        self.weights = (
-            noise_like(trajectory.positions, self.generator),
-            noise_like(trajectory.manipulator_poses, self.generator),
-        )
-        self.gradient: RolloutGradient = self.simulator.vjp(trajectory, *self.weights)
+        self.base = tuple(output.double() for output in self.outputs(trajectory))
+        self.weights = tuple(noise_like(output, self.generator) for output in self.outputs(trajectory))
+        self.gradient = self.pull_back(trajectory)
+
+    def outputs(self, trajectory: Trajectory) -> tuple[Tensor, ...]:
+        """What the loss is about."""
+        return trajectory.positions, trajectory.manipulator_poses
+
+    def pull_back(self, trajectory: Trajectory) -> RolloutGradient:
+        """Gradient of the loss."""
+        return self.simulator.vjp(trajectory, *self.weights)
 
     def loss(self, state: State, actions: Tensor) -> float:
         """The linear loss, relative to that of the unchanged rollout."""
         result = self.simulator.rollout(state, actions)
-        moments = (result.positions.double(), result.manipulator_poses.double())
         return sum(
-            float(((now - before) * weight.double()).sum())
-            for now, before, weight in zip(moments, self.base, self.weights, strict=True)
+            float(((now.double() - before) * weight.double()).sum())
+            for now, before, weight in zip(self.outputs(result), self.base, self.weights, strict=True)
         )
 
     def error(self, name: str) -> float:
@@ -111,7 +120,7 @@ def check_gradient(bench: SimulatorBench, *, name: str) -> Finding:
     bench.require_gradient()
     if name in ("actions", "manipulator_pose") and not bench.scene.action_size:
         raise Skip("The scene has no tool that moves.")
-    return Finding(_Probe(bench, bench.scene).error(name), bench.bound(DOUBLE_BOUND, SINGLE_BOUND))
+    return Finding(Probe(bench, bench.scene).error(name), bench.bound(DOUBLE_BOUND, SINGLE_BOUND))
 
 
 def check_kind_gradients(bench: SimulatorBench) -> Finding:
@@ -119,7 +128,7 @@ def check_kind_gradients(bench: SimulatorBench) -> Finding:
     bench.require_gradient()
     figures = {}
     for kind in bench.capabilities.manipulator_kinds:
-        probe = _Probe(bench, resting(example_tool(kind)))
+        probe = Probe(bench, resting(example_tool(kind)))
         for name in ("actions", "manipulator_pose", "position"):
             figures[f"{name} with {kind}"] = probe.error(name)
     if not figures:

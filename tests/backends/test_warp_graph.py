@@ -226,6 +226,21 @@ def test_replays_equal_launches_bit_for_bit(case: str, budget: int) -> None:
 
 
 @pytest.mark.parametrize("budget", [0, 1 << 29])
+def test_the_gradient_of_the_final_state_comes_and_goes(budget: int) -> None:
+    expecting, simulator = plain("two tools", memory_budget=budget), slotted("two tools", memory_budget=budget)
+    generator = torch.Generator().manual_seed(7)
+    for given in (False, True, False, True, True, False):
+        expected, made = (each.rollout(*inputs(expecting)) for each in (expecting, simulator))
+        gradient, poses = gradients_for(expected)
+        end = expected.final_state.map(lambda tensor: torch.randn(tensor.shape, generator=generator).to(tensor)) if given else None
+        assert_equal(
+            simulator.vjp(made, gradient, poses, grad_final_state=end),
+            expecting.vjp(expected, gradient, poses, grad_final_state=end),
+        )
+        del made
+
+
+@pytest.mark.parametrize("budget", [0, 1 << 29])
 def test_warp_itself_captures_a_rollout(budget: int) -> None:
     captures: list[Any] = []
 

@@ -75,6 +75,14 @@ class SimulatorTerse(SimulatorWarp):
             raise RuntimeError("bad shape") from error
 
 
+class SimulatorTrusting(SimulatorWarp):
+    """Looks at shapes only."""
+
+    def check_inputs(self, state, actions):
+        fine = self.initial_state(batch_size=state.batch_size)
+        super().check_inputs(fine, torch.zeros_like(actions))
+
+
 class SimulatorGhosts(SimulatorWarp):
     """Tools pass through the clay."""
 
@@ -90,6 +98,31 @@ class SimulatorShy(SimulatorWarp):
     """Declares that it is not differentiable, but answers."""
 
     capabilities = dataclasses.replace(SimulatorWarp.capabilities, differentiable=False)
+
+
+class SimulatorBorrowing(SimulatorWarp):
+    """Rolls out anew on the way back, from tensors that the caller may have written to since."""
+
+    def vjp(self, trajectory, grad_positions, grad_manipulators=None, **options):
+        again = self.rollout(trajectory.initial_state, trajectory.actions)
+        return super().vjp(again, grad_positions, grad_manipulators, **options)
+
+
+class SimulatorOneWay(SimulatorWarp):
+    """Written before rollouts could be chained."""
+
+    def vjp(self, trajectory, grad_positions, grad_manipulators=None):
+        return super().vjp(trajectory, grad_positions, grad_manipulators)
+
+
+class SimulatorMatrixStrain(SimulatorWarp):
+    """Takes the gradient of the final strain as that of the matrix's entries, and gives that of the six numbers."""
+
+    def vjp(self, trajectory, grad_positions, grad_manipulators=None, *, grad_final_state=None):
+        if grad_final_state is not None:
+            strain = grad_final_state.elastic_strain * torch.tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+            grad_final_state = dataclasses.replace(grad_final_state, elastic_strain=strain)
+        return super().vjp(trajectory, grad_positions, grad_manipulators, grad_final_state=grad_final_state)
 
 
 def jitter(trajectory, simulator, _):
@@ -129,6 +162,11 @@ BROKEN_SIMULATORS = {
     "declared manipulator kinds run": SimulatorGhosts,
     "capabilities hold": SimulatorLooseDeclarations,
     "bad arguments are named": SimulatorTerse,
+    "senseless numbers are refused": SimulatorTrusting,
+    "a trajectory is a copy of what was given": changed_rollout(
+        lambda trajectory, _, state: dataclasses.replace(trajectory, initial_state=state)
+    ),
+    "gradient is that of what was rolled out": SimulatorBorrowing,
     "mass and uniform motion are kept": final_with(velocity=lambda velocity: 0.999 * velocity),
     "momentum is kept without forces": final_with(velocity=lambda velocity: 0.999 * velocity),
     "angular momentum is kept without forces": final_with(affine=lambda affine: 0.9 * affine),
@@ -146,6 +184,8 @@ BROKEN_SIMULATORS = {
     "gradient of a batch is a loop over worlds": changed_gradient(mixed_gradients),
     "gradient is finite from rest": changed_gradient(infinite_without_actions),
     "gradient is refused where not declared": SimulatorShy,
+    "gradient of the final state": SimulatorOneWay,
+    "gradient of 2T steps is that of T steps twice": SimulatorMatrixStrain,
 }
 
 

@@ -29,11 +29,13 @@ class _Checkpoints:
     """What is kept of a rollout.
 
     Attributes:
+        actions: Actions (W, T, A).
         poses: Tool poses (W, T * substeps + 1, max(M, 1), 8) in every frame.
         starts: Particles (W N, 21) at the start of each step.
         substeps: Per step, its substeps' records; None where they are to be computed anew.
     """
 
+    actions: Tensor
     poses: Tensor
     starts: tuple[Tensor, ...]
     substeps: tuple[tuple[Substep, ...] | None, ...]
@@ -123,8 +125,7 @@ class SimulatorTaichi(SimulatorCheckpointing):
     def rollout(self, state: State, actions: Tensor) -> Trajectory:
         """Simulate T environment steps; see `Simulator.rollout`."""
         self.check_inputs(state, actions)
-        state = state.to(device=self.device, dtype=self.dtype).map(lambda tensor: tensor.detach().contiguous())
-        actions = actions.detach().to(device=self.device, dtype=self.dtype).contiguous()
+        state, actions = state.map(self._own), self._own(actions)
         worlds, steps, tools = state.batch_size, actions.shape[1], state.manipulator_pose.shape[1]
         positions = torch.empty(worlds, steps + 1, state.particle_count, 3, dtype=self.dtype, device=self.device)
         positions[:, 0] = state.position
@@ -143,10 +144,10 @@ class SimulatorTaichi(SimulatorCheckpointing):
         return Trajectory(
             positions=positions,
             manipulator_poses=frames,
-            actions=actions,
+            actions=actions.clone(),
             initial_state=state,
             final_state=final,
-            checkpoints=(_Checkpoints(poses, tuple(starts), tuple(kept)),),
+            checkpoints=(_Checkpoints(actions, poses, tuple(starts), tuple(kept)),),
         )
 
     def _run_step(
@@ -160,35 +161,41 @@ class SimulatorTaichi(SimulatorCheckpointing):
                 records.append(record)
         return (tuple(records) if keep else None), particles
 
-    def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
+    def vjp(
+        self,
+        trajectory: Trajectory,
+        grad_positions: Tensor,
+        grad_manipulators: Tensor | None = None,
+        *,
+        grad_final_state: State | None = None,
+    ) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
-        self._check_gradient(trajectory, grad_positions)
-        state, actions = trajectory.initial_state, trajectory.actions
-        grad_positions = grad_positions.detach().to(device=self.device, dtype=self.dtype)
+        positions, poses, final = self._incoming(trajectory, grad_positions, grad_manipulators, grad_final_state)
+        (kept,) = trajectory.checkpoints
+        state, actions = trajectory.initial_state, kept.actions
         with self._stream():
-            gradient, grad_poses = self._pull_back_particles(trajectory, grad_positions)
-            if grad_manipulators is not None:
+            gradient, grad_poses = self._pull_back_particles(kept, positions, final)
+            if poses is not None:
                 tools = state.manipulator_pose.shape[1]
-                grad_poses[:, :: self.scene.substeps, :tools] += grad_manipulators.to(grad_poses)
+                grad_poses[:, :: self.scene.substeps, :tools] += poses
             grad_start, grad_actions = torch.zeros_like(state.manipulator_pose), torch.zeros_like(actions)
             if tools := state.manipulator_pose.shape[1]:
-                inputs = (actions, self._program.tools, self.scene.substeps, tools, trajectory.checkpoints[0].poses)
+                inputs = (actions, self._program.tools, self.scene.substeps, tools, kept.poses)
                 self._program.kernels.move_tools_adjoint(*inputs, grad_poses, grad_actions, grad_start)
             start = _state(gradient, grad_start)
         # the kernels hold the strain's gradient as a symmetric matrix; the state's off-diagonal numbers stand for two entries
         start.elastic_strain[..., 3:] *= 2.0
         return RolloutGradient(actions=grad_actions, initial_state=start)
 
-    def _pull_back_particles(self, trajectory: Trajectory, grad_positions: Tensor) -> tuple[Tensor, Tensor]:
+    def _pull_back_particles(self, kept: _Checkpoints, grad_positions: Tensor, final: State | None) -> tuple[Tensor, Tensor]:
         """Gradients with respect to the particles (W N, 21) at the start and the poses (W, frames, M, 8)."""
-        (kept,) = trajectory.checkpoints
         worlds, frames, tools = kept.poses.shape[:3]
         stepper = Stepper(self._program, worlds=worlds, threads=self.threads)
-        gradient = torch.zeros_like(kept.starts[0])
+        gradient = torch.zeros_like(kept.starts[0]) if final is None else _records(final)
         grad_poses = torch.zeros(stepper.rows * worlds, frames, tools, 8, dtype=self.dtype, device=self.device)
         position = gradient.view(worlds, -1, RECORD_SIZE)[..., :VELOCITY]
         steps = len(kept.starts)
-        position += grad_positions[:, steps]
+        position.copy_(grad_positions[:, steps])
         for step in reversed(range(steps)):
             records = kept.substeps[step]
             if records is None:
@@ -218,8 +225,8 @@ class SimulatorTaichi(SimulatorCheckpointing):
         if worlds * history > self.memory_budget:
             # records of a step, and half as much again that the allocator does not find a use for between two steps (measured)
             history = step_count * particles + self._history_bytes(1) * 3 // 2
-        # snapshots and the caller's gradient of them; final state, its gradient, and what a substep makes
-        return worlds * (history + work + 2 * snapshots + 3 * particles)
+        # snapshots and the caller's gradient of them; initial and final state, a gradient, and what a substep makes
+        return worlds * (history + work + 2 * snapshots + 4 * particles)
 
 
 def _records(state: State) -> Tensor:
@@ -232,11 +239,10 @@ def _state(records: Tensor, poses: Tensor) -> State:
     """State, or gradient with respect to one, of particles (W N, 21) and tool poses (W, M, 8)."""
     worlds = poses.shape[0]
     parts = records.view(worlds, -1, RECORD_SIZE)
-    affine = parts[..., AFFINE:STRAIN].reshape(worlds, -1, 3, 3)
-    return State(
-        parts[..., POSITION:VELOCITY].contiguous(),
-        parts[..., VELOCITY:AFFINE].contiguous(),
-        affine.contiguous(),
-        parts[..., STRAIN:].contiguous(),
-        poses,
+    affine = parts[..., AFFINE:STRAIN].view(worlds, -1, 3, 3)
+    # cloned: slices of a single particle count as contiguous already, and would stay parts of the records
+    position, velocity, affine, strain = (
+        part.clone(memory_format=torch.contiguous_format)
+        for part in (parts[..., POSITION:VELOCITY], parts[..., VELOCITY:AFFINE], affine, parts[..., STRAIN:])
     )
+    return State(position, velocity, affine, strain, poses)

@@ -239,6 +239,9 @@ class RolloutSlot:
         self._poses = torch.zeros(worlds, frames, columns, 8, **options)
         self._grad_positions = torch.zeros(steps + 1, worlds, count, 3, **options)
         self._grad_manipulators = torch.zeros(worlds, steps + 1, tools, 8, **options)
+        # with respect to velocity, affine field and strain of the end; zero unless a vjp is given them
+        self._grad_final = tuple(torch.zeros(shape, **options) for shape in shapes[1:])
+        self._final_given = False
         self._gradient = _state([torch.zeros(shape, **options) for shape in (*shapes, (worlds, tools, 8))])
         self._grad_particles = self._view_particles(_particle_tensors(self._gradient))
         self._grad_actions = torch.zeros_like(self._actions)
@@ -281,13 +284,26 @@ class RolloutSlot:
         poses = self._poses[:, :: self._program.substeps, :tools].clone(memory_format=torch.contiguous_format)
         return positions, poses, _state([*(rows[-1].clone() for rows in self._rows), poses[:, -1].clone()])
 
-    def vjp(self, grad_positions: Tensor, grad_manipulators: Tensor | None) -> RolloutGradient:
-        """Pull gradients back through the last rollout; see `Simulator.vjp`. The gradients are copies."""
+    def vjp(self, grad_positions: Tensor, grad_manipulators: Tensor | None, final: State | None = None) -> RolloutGradient:
+        """Pull gradients back through the last rollout; see `Simulator.vjp`. The gradients are copies.
+
+        Args:
+            grad_positions: Gradient (W, T+1, N, 3).
+            grad_manipulators: Gradient (W, T+1, M, 8); None for zero.
+            final: Gradient with respect to the final state, of whose positions and poses the other two know; None for zero.
+        """
         self._grad_positions.copy_(grad_positions.transpose(0, 1))
         if grad_manipulators is None:
             self._grad_manipulators.zero_()
         else:
             self._grad_manipulators.copy_(grad_manipulators)
+        if final is not None:
+            for kept, given in zip(self._grad_final, _particle_tensors(final)[1:], strict=True):
+                kept.copy_(given)
+        elif self._final_given:
+            for kept in self._grad_final:
+                kept.zero_()
+        self._final_given = final is not None
         self._backward.run(self._launch_vjp)
         return RolloutGradient(actions=self._grad_actions.clone(), initial_state=self._gradient.clone())
 
@@ -319,9 +335,10 @@ class RolloutSlot:
     def _launch_vjp(self) -> None:
         """All of a vjp; see `_launch_rollout` for what it may not do."""
         gradient, steps = self._gradient, self._key.steps
-        for tensor in (*_particle_tensors(gradient), gradient.manipulator_pose, self._grad_actions, self._grad_poses):
+        for tensor in (gradient.manipulator_pose, self._grad_actions, self._grad_poses):
             tensor.zero_()
-        gradient.position.add_(self._grad_positions[steps])
+        for tensor, last in zip(_particle_tensors(gradient), (self._grad_positions[steps], *self._grad_final), strict=True):
+            tensor.copy_(last)
         after = self._particles[steps].velocity
         for step in reversed(range(steps)):
             after = self._launch_vjp_step(step, after)

@@ -47,6 +47,21 @@ class _LaneCheckpoints:
     final: Particles
 
 
+@dataclasses.dataclass(frozen=True)
+class _Checkpoints:
+    """What is kept of a rollout that was launched kernel by kernel.
+
+    Attributes:
+        actions: Actions (B, T, A).
+        poses: Tool poses (B, T * substeps + 1, max(M, 1), 8) in every frame.
+        lanes: What each lane keeps.
+    """
+
+    actions: Tensor
+    poses: Tensor
+    lanes: tuple[_LaneCheckpoints, ...]
+
+
 class SimulatorWarp(SimulatorCheckpointing):
     """MLS-MPM with von Mises plasticity on NVIDIA Warp, with hand-written adjoints.
 
@@ -183,8 +198,7 @@ class SimulatorWarp(SimulatorCheckpointing):
     def rollout(self, state: State, actions: Tensor) -> Trajectory:
         """Simulate T environment steps; see `Simulator.rollout`."""
         self.check_inputs(state, actions)
-        state = state.to(device=self.device, dtype=self.dtype).map(lambda tensor: tensor.detach().contiguous())
-        actions = actions.detach().to(device=self.device, dtype=self.dtype).contiguous()
+        state, actions = state.map(self._own), self._own(actions)
         worlds, steps = state.batch_size, actions.shape[1]
         keep = worlds * self._history_bytes(steps, worlds) <= self.memory_budget
         if self._slots is None:
@@ -222,10 +236,11 @@ class SimulatorWarp(SimulatorCheckpointing):
         return Trajectory(
             positions=positions,
             manipulator_poses=frames.clone(),
-            actions=actions,
-            initial_state=state,
+            # the checkpoints hold those that were rolled out
+            actions=actions.clone(),
+            initial_state=state.clone(),
             final_state=final,
-            checkpoints=tuple(lanes),
+            checkpoints=(_Checkpoints(actions, poses, tuple(lanes)),),
         )
 
     def _particles(self, state: State, worlds: slice) -> Particles:
@@ -264,33 +279,44 @@ class SimulatorWarp(SimulatorCheckpointing):
                 records.append(record)
         return (tuple(records) if keep else None), particles
 
-    def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
+    def vjp(
+        self,
+        trajectory: Trajectory,
+        grad_positions: Tensor,
+        grad_manipulators: Tensor | None = None,
+        *,
+        grad_final_state: State | None = None,
+    ) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
-        self._check_gradient(trajectory, grad_positions)
-        grad_positions = grad_positions.detach().to(device=self.device, dtype=self.dtype)
-        grad_poses = None if grad_manipulators is None else grad_manipulators.detach()
+        positions, poses, final = self._incoming(trajectory, grad_positions, grad_manipulators, grad_final_state)
         lease = trajectory.checkpoints[0]
         if self._slots is None or not isinstance(lease, Lease):
-            return self._vjp_lanes(trajectory, grad_positions, grad_poses)
+            return self._vjp_lanes(trajectory, positions, poses, final)
         slot: RolloutSlot = lease.slot
         with self._stream():
-            return self._slots.with_memory(lambda: slot.vjp(grad_positions, grad_poses))
+            return self._slots.with_memory(lambda: slot.vjp(positions, poses, final))
 
-    def _vjp_lanes(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None) -> RolloutGradient:
+    def _vjp_lanes(
+        self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None, final: State | None
+    ) -> RolloutGradient:
         """Launch a vjp kernel by kernel."""
-        state, actions = trajectory.initial_state, trajectory.actions
+        (kept,) = trajectory.checkpoints
+        state = trajectory.initial_state
         gradient = state.map(torch.zeros_like)
+        if final is not None:
+            last = {name: getattr(final, name) for name in ("velocity", "affine", "elastic_strain")}
+            gradient = dataclasses.replace(gradient, **last)
         lanes = self._lanes(state.batch_size)
         with self._stream():
             parts = self._over_lanes(
-                list(zip(lanes, trajectory.checkpoints, strict=True)),
+                list(zip(lanes, kept.lanes, strict=True)),
                 lambda pair: self._vjp_lane(pair[0][0], pair[1], grad_positions, gradient),
             )
             grad_poses = torch.cat(parts)
             if grad_manipulators is not None:
                 tools = state.manipulator_pose.shape[1]
                 grad_poses[:, :: self.scene.substeps, :tools] += grad_manipulators.to(grad_poses)
-            grad_actions = self._pull_back_tools(trajectory, actions, grad_poses, gradient)
+            grad_actions = self._pull_back_tools(kept, grad_poses, gradient)
         # the kernels hold the strain's gradient as a symmetric matrix; the state's off-diagonal numbers stand for two entries
         gradient.elastic_strain[..., 3:] *= 2.0
         return RolloutGradient(actions=grad_actions, initial_state=gradient)
@@ -322,19 +348,18 @@ class SimulatorWarp(SimulatorCheckpointing):
             after = records[index].particles.velocity
         return after
 
-    def _pull_back_tools(self, trajectory: Trajectory, actions: Tensor, grad_poses: Tensor, gradient: State) -> Tensor:
+    def _pull_back_tools(self, kept: _Checkpoints, grad_poses: Tensor, gradient: State) -> Tensor:
         """Gradient (B, T, A) of the actions; writes that of the start poses to `gradient`."""
-        grad_actions = torch.zeros_like(actions)
+        grad_actions = torch.zeros_like(kept.actions)
         worlds, tools = gradient.manipulator_pose.shape[:2]
         if not tools:
             return grad_actions
         types = self._types
-        poses = self._move_tools(trajectory.initial_state, actions)
         inputs = [
-            self._wrap(actions, self._real),
+            self._wrap(kept.actions, self._real),
             self._program.tools,
             self.scene.substeps,
-            self._wrap(poses, types.vec8),
+            self._wrap(kept.poses, types.vec8),
             self._wrap(grad_poses, types.vec8),
             self._wrap(grad_actions, self._real),
             self._wrap(gradient.manipulator_pose, types.vec8),
@@ -363,10 +388,11 @@ class SimulatorWarp(SimulatorCheckpointing):
         history = worlds * self._history_bytes(step_count, worlds)
         if history > self.memory_budget:
             history = worlds * step_count * particles + active * self._history_bytes(1, worlds)
-        # snapshots and the caller's gradient of them; final state, its gradient, and what a substep makes
-        common = 2 * snapshots + 3 * particles
-        if self._slots is not None:  # a slot has the gradient of the snapshots, the end and its gradient for itself once more
-            common += snapshots + 2 * particles
+        # snapshots and the caller's gradient of them; initial state, twice where the checkpoints hold it, too; final state, a
+        # gradient, and what a substep makes
+        common = 2 * snapshots + (4 if self._slots is not None else 5) * particles
+        if self._slots is not None:  # a slot has the gradients of the snapshots and of the end, the end and its gradient once more
+            common += snapshots + 3 * particles
         return history + work + worlds * common
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.final_gradient import check_final_gradient
 from cpdeform.core.scene import Body, Scene
 from cpdeform.core.simulator import RolloutGradient, Simulator, SimulatorCapabilities, Trajectory
 from cpdeform.core.state import State
@@ -83,22 +84,32 @@ class SimulatorExample(Simulator):
         return Trajectory(
             positions=torch.stack([each.position for each in states], dim=1),
             manipulator_poses=torch.stack([each.manipulator_pose for each in states], dim=1),
-            actions=actions,
-            initial_state=states[0],
+            actions=actions.clone(),
+            initial_state=states[0].clone(),
             final_state=states[-1],
-            checkpoints=tuple(states[:-1]),
+            checkpoints=(actions, tuple(states[:-1])),
         )
 
-    def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
+    def vjp(
+        self,
+        trajectory: Trajectory,
+        grad_positions: Tensor,
+        grad_manipulators: Tensor | None = None,
+        *,
+        grad_final_state: State | None = None,
+    ) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
         _check_gradients(trajectory, grad_positions, grad_manipulators)
+        check_final_gradient(trajectory, grad_final_state)
         grad_poses = torch.zeros_like(trajectory.manipulator_poses) if grad_manipulators is None else grad_manipulators
         last = trajectory.step_count
-        grad_actions = torch.zeros_like(trajectory.actions)
-        grad = _add(trajectory.final_state.map(torch.zeros_like), grad_positions[:, last], grad_poses[:, last])
+        actions, starts = trajectory.checkpoints
+        grad_actions = torch.zeros_like(actions)
+        like = trajectory.final_state
+        end = like.map(torch.zeros_like) if grad_final_state is None else grad_final_state.to(device=self.device, dtype=self.dtype)
+        grad = _add(end, grad_positions[:, last], grad_poses[:, last])
         for step in reversed(range(last)):
-            start, action = trajectory.checkpoints[step], trajectory.actions[:, step]
-            grad, grad_actions[:, step] = self._pull_back(start, action, grad)
+            grad, grad_actions[:, step] = self._pull_back(starts[step], actions[:, step], grad)
             grad = _add(grad, grad_positions[:, step], grad_poses[:, step])
         return RolloutGradient(actions=grad_actions, initial_state=grad)
 

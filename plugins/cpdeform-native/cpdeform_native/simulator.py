@@ -92,8 +92,7 @@ class SimulatorNative(SimulatorCheckpointing):
     def rollout(self, state: State, actions: Tensor) -> Trajectory:
         """Simulate T environment steps; see `Simulator.rollout`."""
         self.check_inputs(state, actions)
-        state = state.to(device=self.device, dtype=self.dtype).map(lambda tensor: tensor.detach().contiguous())
-        actions = actions.detach().to(device=self.device, dtype=self.dtype).contiguous()
+        state, actions = state.map(self._own), self._own(actions)
         worlds, steps, tools = state.batch_size, actions.shape[1], state.manipulator_pose.shape[1]
         positions = torch.empty(worlds, steps + 1, state.particle_count, 3, dtype=self.dtype)
         poses = torch.empty(worlds, steps + 1, tools, 8, dtype=self.dtype)
@@ -120,29 +119,35 @@ class SimulatorNative(SimulatorCheckpointing):
         return Trajectory(
             positions=positions,
             manipulator_poses=poses,
-            actions=actions,
+            actions=actions.clone(),
             initial_state=state,
             final_state=final,
-            checkpoints=(checkpoints,),
+            checkpoints=(checkpoints, actions),
         )
 
-    def vjp(self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None = None) -> RolloutGradient:
+    def vjp(
+        self,
+        trajectory: Trajectory,
+        grad_positions: Tensor,
+        grad_manipulators: Tensor | None = None,
+        *,
+        grad_final_state: State | None = None,
+    ) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
-        self._check_gradient(trajectory, grad_positions)
-        if not self._engine.made(trajectory.checkpoints[0]):
+        positions, poses, final = self._incoming(trajectory, grad_positions, grad_manipulators, grad_final_state)
+        checkpoints, actions = trajectory.checkpoints
+        if not self._engine.made(checkpoints):
             raise InputError("trajectory", came="one made by another simulator", expected="one made by this simulator's rollout")
         gradient = trajectory.initial_state.map(torch.empty_like)
-        grad_actions = torch.zeros(trajectory.actions.shape, dtype=torch.float64)
+        grad_actions = torch.zeros(actions.shape, dtype=torch.float64)
         grad_pose = torch.empty(gradient.manipulator_pose.shape, dtype=torch.float64)
-        grad_positions = grad_positions.detach().to(device=self.device, dtype=self.dtype).contiguous()
-        poses = None
-        if grad_manipulators is not None:
-            poses = grad_manipulators.detach().to(device=self.device, dtype=self.dtype).contiguous().numpy()
+        last = (None, None, None) if final is None else _arrays(final.velocity, final.affine, final.elastic_strain)
         self._engine.vjp(
-            trajectory.checkpoints[0],
-            trajectory.actions.numpy(),
-            grad_positions.numpy(),
-            poses,
+            checkpoints,
+            actions.numpy(),
+            positions.contiguous().numpy(),
+            None if poses is None else poses.contiguous().numpy(),
+            *last,
             *_arrays(grad_actions, gradient.position, gradient.velocity, gradient.affine, gradient.elastic_strain, grad_pose),
         )
         start = dataclasses.replace(gradient, manipulator_pose=grad_pose.to(self.dtype))
@@ -166,8 +171,8 @@ class SimulatorNative(SimulatorCheckpointing):
         # frames in scene and step order and their gradients; grids of momentum, velocity and gradients
         work = active * (5 * particles + 5 * self._grid_bytes())
         snapshots = (step_count + 1) * count * 3 * self.dtype.itemsize
-        # trajectory and the caller's gradient of it; final state and gradient of the initial one
-        return history + work + worlds * (2 * snapshots + 2 * particles)
+        # trajectory and the caller's gradient of it; initial and final state, and gradient of the initial one
+        return history + work + worlds * (2 * snapshots + 3 * particles)
 
     def release_memory(self) -> None:
         """Give back to the system what is kept between rollouts to be used again; trajectories stay usable."""

@@ -123,7 +123,8 @@ class Simulator {
   }
 
   void vjp(Checkpoints<Real>& checkpoints, In<Real> actions, In<Real> grad_positions, std::optional<In<Real>> grad_poses,
-           Out<double> grad_actions, Out<Real> grad_position, Out<Real> grad_velocity, Out<Real> grad_affine, Out<Real> grad_strain,
+           std::optional<In<Real>> grad_last_velocity, std::optional<In<Real>> grad_last_affine,
+           std::optional<In<Real>> grad_last_strain, Out<double> grad_actions, Out<Real> grad_position, Out<Real> grad_velocity, Out<Real> grad_affine, Out<Real> grad_strain,
            Out<double> grad_pose) {
     const Scene& s = shared_->scene;
     const int64_t worlds = checkpoints.worlds, steps = checkpoints.steps;
@@ -132,6 +133,13 @@ class Simulator {
     expect_size("actions", actions.size(), worlds * steps * s.action_size);
     expect_size("grad_positions", grad_positions.size(), 3 * particles * (steps + 1));
     if (grad_poses) expect_size("grad_poses", grad_poses->size(), tools * (steps + 1));
+    if (bool(grad_last_velocity) != bool(grad_last_affine) || bool(grad_last_velocity) != bool(grad_last_strain))
+      throw std::invalid_argument("grad_last: expected gradients of velocity, affine and strain, or of none");
+    if (grad_last_velocity) {
+      expect_size("grad_last_velocity", grad_last_velocity->size(), 3 * particles);
+      expect_size("grad_last_affine", grad_last_affine->size(), 9 * particles);
+      expect_size("grad_last_strain", grad_last_strain->size(), 6 * particles);
+    }
     expect_size("grad_actions", grad_actions.size(), worlds * steps * s.action_size);
     expect_size("grad_position", grad_position.size(), 3 * particles);
     expect_size("grad_velocity", grad_velocity.size(), 3 * particles);
@@ -143,6 +151,9 @@ class Simulator {
                                           actions.data(),
                                           grad_positions.data(),
                                           grad_poses ? grad_poses->data() : nullptr,
+                                          grad_last_velocity ? grad_last_velocity->data() : nullptr,
+                                          grad_last_affine ? grad_last_affine->data() : nullptr,
+                                          grad_last_strain ? grad_last_strain->data() : nullptr,
                                           grad_actions.data(),
                                           grad_position.data(),
                                           grad_velocity.data(),
@@ -171,8 +182,8 @@ void bind(nb::module_& m, const char* name, const char* checkpoints) {
       .def("made", &Simulator<Real>::made, "checkpoints"_a)
       .def("rollout", &Simulator<Real>::rollout, "worlds"_a, "steps"_a, "position"_a, "velocity"_a, "affine"_a, "strain"_a, "pose"_a,
            "actions"_a, "positions"_a, "poses"_a, "last_velocity"_a, "last_affine"_a, "last_strain"_a, "keep"_a)
-      .def("vjp", &Simulator<Real>::vjp, "checkpoints"_a, "actions"_a, "grad_positions"_a, "grad_poses"_a.none(), "grad_actions"_a,
-           "grad_position"_a, "grad_velocity"_a, "grad_affine"_a, "grad_strain"_a, "grad_pose"_a);
+      .def("vjp", &Simulator<Real>::vjp, "checkpoints"_a, "actions"_a, "grad_positions"_a, "grad_poses"_a.none(),
+           "grad_last_velocity"_a.none(), "grad_last_affine"_a.none(), "grad_last_strain"_a.none(), "grad_actions"_a, "grad_position"_a, "grad_velocity"_a, "grad_affine"_a, "grad_strain"_a, "grad_pose"_a);
 }
 
 void copy(const std::vector<double>& from, double* to, size_t size, const char* name) {

@@ -39,6 +39,10 @@ struct VjpArguments {
   const Real* actions;         // (B, T, A)
   const Real* grad_positions;  // (B, T + 1, N, 3)
   const Real* grad_poses;      // (B, T + 1, M, 8), or null
+  // with respect to the final state, all or none of them null
+  const Real* grad_last_velocity;  // (B, N, 3)
+  const Real* grad_last_affine;    // (B, N, 3, 3)
+  const Real* grad_last_strain;    // (B, N, 6): derivatives by the entries of a matrix, of which an off-diagonal number stands for two
   double* grad_actions;        // (B, T, A), out, zero before
   Real* grad_position;         // (B, N, 3), out
   Real* grad_velocity;         // (B, N, 3), out

@@ -163,6 +163,14 @@ class EngineOf final : public cpdeform::Engine<Real> {
     for (int c = 0; c < component_count; ++c)
       for (int64_t p = range.first; p < range.last; ++p)
         gradient[c * stride + p] = c < 3 ? grad_positions[(a.steps * n + p) * 3 + c] : Real(0);
+    if (a.grad_last_velocity)
+      for (int64_t p = range.first; p < range.last; ++p) {
+        const int64_t q = w * n + p;
+        Real* to = gradient + p;
+        for (int c = 0; c < 3; ++c) to[(at_velocity + c) * stride] = a.grad_last_velocity[3 * q + c];
+        for (int c = 0; c < 9; ++c) to[(at_affine + c) * stride] = a.grad_last_affine[9 * q + c];
+        for (int c = 0; c < 6; ++c) to[(at_strain + c) * stride] = a.grad_last_strain[6 * q + c];
+      }
     crew.barrier();
     for (int64_t step = a.steps - 1; step >= 0; --step)
       world_.backward(crew, work, history.steps[step], history.poses, step, grad_positions + step * n * 3);
