@@ -16,6 +16,7 @@ from backend_cases import BACKENDS, ORACLE, backend_class, scene, simulator_clas
 from cpdeform.core.simulator import Simulator, Trajectory, differentiable_rollout
 from cpdeform.core.task import load_task
 from cpdeform.planning.optimizer import TrajectoryOptimizer
+from cpdeform.planning.pruner import PrunerNone
 from cpdeform.run.deform import deform
 
 CALLS = 500
@@ -101,7 +102,7 @@ def test_a_long_search_keeps_no_trajectory(backend: str, tmp_path: Path) -> None
             alive.append(weakref.ref(trajectory.positions))
             return trajectory
 
-    optimizer = TrajectoryOptimizer(iterations=30, patience=30, schedule="paper")
+    optimizer = TrajectoryOptimizer(iterations=30, patience=30, pruner=PrunerNone())
     deform(task, simulator=Watched(task.scene, batch_size=4), placer="fixed", optimizer=optimizer)
     assert len(alive) >= 30
     assert most <= 1
