@@ -12,6 +12,7 @@ from pydantic import Field, PositiveFloat, field_validator
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.objectives.contact import ContactKind
+from cpdeform.core.ot import LEAST_RELATIVE_BLUR
 from cpdeform.core.plugins import AUTO
 from cpdeform.core.priorities import PriorityKind
 from cpdeform.core.scene import FrozenModel
@@ -57,12 +58,13 @@ class PrioritiesConfiguration(FrozenModel):
             of the cost |x - y|^2 moves each particle, from a solver with an option `exponent`. See
             `cpdeform.core.priorities.transport_priorities`.
         blur: Entropic blur of the transport problem, length units. The larger, the quicker and the smoother; up to half a
-            centimetre the potentials' peak stays at the particles that have to move, displacements allow for two.
+            centimetre the potentials' peak stays at the particles that have to move, displacements allow for two. At least a millionth
+            of the domain's edge.
     """
 
     kind: PriorityKind = "potential"
 
-    blur: float = Field(default=5e-3, gt=0.0)
+    blur: float = Field(default=5e-3, ge=LEAST_RELATIVE_BLUR)
 
 
 class ObjectiveConfiguration(FrozenModel):
@@ -72,7 +74,7 @@ class ObjectiveConfiguration(FrozenModel):
         kind: ``"transport"``: transport cost between the last step's particles and the goal (the paper); ``"plasticinelab"``:
             density, distance and contact terms of node masses, summed over all steps.
         points: Particles that the transport loss is computed on, a fixed random subset; None for all.
-        blur: Entropic blur of the transport loss, length units.
+        blur: Entropic blur of the transport loss, length units; at least a millionth of the domain's edge.
         refresh: Solve from scratch every so many evaluations, warm-started between.
         contact_weight: Weight of PlasticineLab's contact term, which draws tools to the body; where absent 0 for ``"transport"``
             and 1 for ``"plasticinelab"``.
@@ -85,7 +87,7 @@ class ObjectiveConfiguration(FrozenModel):
 
     kind: Literal["transport", "plasticinelab"] = "transport"
     points: int | None = Field(default=2000, ge=1)
-    blur: float = Field(default=2e-3, gt=0.0)
+    blur: float = Field(default=2e-3, ge=LEAST_RELATIVE_BLUR)
     refresh: int = Field(default=50, ge=1)
     contact_weight: float | None = Field(default=None, ge=0.0)
     coast_steps: float = Field(default=0.0, ge=0.0)
