@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from cpdeform.core.errors import InputError
 from cpdeform.core.sampling import body_index
 from cpdeform.core.scene import (
     WALL_NODES,
@@ -16,6 +17,7 @@ from cpdeform.core.scene import (
     ManipulatorCylinder,
     ManipulatorRod,
     ManipulatorSphere,
+    ManipulatorTorus,
     Scene,
     Vector3,
 )
@@ -98,6 +100,9 @@ def tool_size(manipulator: Manipulator) -> tuple[float, ...]:
 
     Sphere (radius); Capsule, RollingPin and Chopsticks (radius, height); Box (half extents, rounding); Cylinder (radius, half
     height); Torus (major radius, tube radius).
+
+    Raises:
+        InputError: The manipulator is of no known kind.
     """
     if isinstance(manipulator, ManipulatorSphere):
         return (manipulator.radius, 0.0, 0.0, 0.0)
@@ -107,7 +112,9 @@ def tool_size(manipulator: Manipulator) -> tuple[float, ...]:
         return (*manipulator.half_extents, manipulator.rounding)
     if isinstance(manipulator, ManipulatorCylinder):
         return (manipulator.radius, manipulator.half_height, 0.0, 0.0)
-    return (manipulator.major_radius, manipulator.tube_radius, 0.0, 0.0)
+    if isinstance(manipulator, ManipulatorTorus):
+        return (manipulator.major_radius, manipulator.tube_radius, 0.0, 0.0)
+    raise InputError("manipulator", came=type(manipulator).__name__, expected="a manipulator of cpdeform.core.scene")
 
 
 def scene_numbers(scene: Scene) -> SceneNumbers:

@@ -11,7 +11,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Stage
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.state import initial_state
-from cpdeform.core.task import changed_task, load_task
+from cpdeform.core.task import changed_task, load_task, validate
 
 
 @pytest.fixture
@@ -100,3 +100,9 @@ def test_the_papers_poses_follow_the_number_of_tools() -> None:
         stage = Stage(0, task.scene, state, state.position[0], priorities, torch.Generator())
         labels[name] = [placement.label for placement in registry.create("placer", "transport", **options).ask(stage)]
     assert labels == {"torus": ["direct"], "airplane": ["left-right", "top-bottom", "front-back"]}
+
+
+@pytest.mark.parametrize("section", ["priorities", "objective"])
+def test_a_blur_next_to_nothing_is_refused(section):
+    with pytest.raises(InputError, match=rf"{section}\.blur: got 1e-30, expected .* 0\.000001"):
+        validate(RunConfiguration, {section: {"blur": 1e-30}}, source="options")
