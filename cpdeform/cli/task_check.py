@@ -10,7 +10,9 @@ import typer
 
 
 def task_check_command(
-    task: Annotated[str, typer.Argument(help="A task's name, with or without a variant, or the path of a YAML file.", metavar="TASK")],
+    task: Annotated[
+        str, typer.Argument(help="A task's name, with or without a variant, or the path of a YAML file.", metavar="TASK")
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Print one object as the last line.")] = False,
 ) -> None:
     """Tell of tools that clay passes through, bodies that stick, and goals that cannot be reached.

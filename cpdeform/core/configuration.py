@@ -58,8 +58,8 @@ class PrioritiesConfiguration(FrozenModel):
             of the cost |x - y|^2 moves each particle, from a solver with an option `exponent`. See
             `cpdeform.core.priorities.transport_priorities`.
         blur: Entropic blur of the transport problem, length units. The larger, the quicker and the smoother; up to half a
-            centimetre the potentials' peak stays at the particles that have to move, displacements allow for two. At least a millionth
-            of the domain's edge.
+            centimetre the potentials' peak stays at the particles that have to move, displacements allow for two. At
+            least a millionth of the domain's edge.
     """
 
     kind: PriorityKind = "potential"

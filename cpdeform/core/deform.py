@@ -33,6 +33,7 @@ from cpdeform.core.resume import Resumption
 from cpdeform.core.simulator import Simulator
 from cpdeform.core.state import State
 from cpdeform.core.task import Task, changed_task, load_task
+from cpdeform.tasks.checks.check import warn_about_tools
 
 MAX_WORLDS = 16
 """Candidates that are solved as one batch; more are solved in several."""
@@ -92,6 +93,7 @@ def deform(
     defaults = with_task_settings(RunConfiguration(**({"placer": placer} if isinstance(placer, str) else {})), task)
     if named and isinstance(simulator, str):
         task = changed_task(task, scene=defaults.scene)
+    warn_about_tools(task.scene)
     placer = defaults.placer if placer is None else placer
     names = {"backend": _part_name(simulator), "ot": _part_name(ot_solver), "placer": _part_name(placer)}
     used_placer: Placer = _part(placer, "placer", registry, **defaults.placer_options)
@@ -184,6 +186,7 @@ def deform_configuration(
     check_names(configuration, registry=registry)
     task = configured_task(configuration, registry=registry) if resumption is None else resumption.task
     configuration = resolved(configuration, registry=registry, task=task if resumption is None else None)
+    warn_about_tools(task.scene)
     placer = registry.create("placer", configuration.placer, **configuration.placer_options)
     simulator_options = {"batch_size": MAX_WORLDS, **configuration.simulator_options}
     simulator = registry.create(

@@ -17,23 +17,26 @@ JOINED_CELLS = 1.0
 
 def check_near_bodies(scene: Scene) -> list[Finding]:
     """Tell of bodies that start with a gap so narrow that they stick to each other. Bodies that touch are plainly meant as one."""
-    findings = []
+    joined: dict[tuple[int, int], float] = {}
+    near: dict[tuple[int, int], float] = {}
     for (first, body), (second, other) in itertools.combinations(enumerate(scene.bodies), 2):
         cells = gap(body, other) / scene.node_distance
         if 1e-6 < cells < FREE_CELLS:
-            joined = cells < JOINED_CELLS
-            findings.append(
-                Finding(
-                    "note" if joined else "warning",
-                    KIND,
-                    f"scene.bodies.{first} and {second}",
-                    f"They start {cells:.2g} grid cells apart, where the grid's nodes are shared: they "
-                    + ("act as one body and do not come apart." if joined else "will stick to each other."),
-                    f"Leave {FREE_CELLS:g} cells ({FREE_CELLS * scene.node_distance:.3g}) between bodies that are to move freely"
-                    + ("; keep them if one body is meant." if joined else "."),
-                )
-            )
+            (joined if cells < JOINED_CELLS else near)[first, second] = cells
+    free = f"Leave {FREE_CELLS:g} cells ({FREE_CELLS * scene.node_distance:.3g}) between bodies that are to move freely"
+    findings = []
+    if joined:
+        what = "They act as one body and do not come apart: they share grid nodes, and a node has one velocity."
+        findings.append(Finding("note", KIND, "scene.bodies", f"{_listed(joined)}. {what}", f"{free}; keep them if one is meant."))
+    if near:
+        what = "They will stick to each other: they share grid nodes, and a node has one velocity."
+        findings.append(Finding("warning", KIND, "scene.bodies", f"{_listed(near)}. {what}", f"{free}."))
     return findings
+
+
+def _listed(pairs: dict[tuple[int, int], float]) -> str:
+    """The pairs of bodies and how many cells are between them."""
+    return ", ".join(f"{first} and {second} start {cells:.2g} grid cells apart" for (first, second), cells in pairs.items())
 
 
 def gap(first: Body, second: Body) -> float:

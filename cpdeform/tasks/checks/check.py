@@ -54,5 +54,7 @@ def warn_about_tools(scene: Scene) -> None:
     """
     for finding in check_tools(scene):
         if finding.severity == "error":
-            raise InputError(finding.where, came=finding.what.rstrip("."), expected="a tool that covers nodes", remedy=finding.remedy)
+            raise InputError(
+                finding.where, came=finding.what.rstrip("."), expected="a tool that covers nodes", remedy=finding.remedy
+            )
         warnings.warn(str(finding), UserWarning, stacklevel=3)

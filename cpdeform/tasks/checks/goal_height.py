@@ -30,28 +30,30 @@ def check_goal_floating(scene: Scene, goal: NDArray[np.float64]) -> list[Finding
     """
     if scene.gravity[1] >= 0.0:
         return []
-    findings = []
+    heights, share = [], 0.0
     labels = solids(goal, FLOATING_CELLS * scene.node_distance)
     free = FLOATING_CELLS * scene.node_distance
     for part in range(int(labels.max()) + 1):
         particles = goal[labels == part]
         height = float(particles[:, 1].min()) - floor_height(scene)
-        share = len(particles) / len(goal)
-        if share < LEAST_PART or height <= free or _near_fixed_tool(scene, particles, free):
-            continue
-        held = _can_grip(scene)
-        findings.append(
-            Finding(
-                "note" if held else "warning",
-                "goal floating",
-                "target",
-                f"A part of the goal ({share:.0%} of its particles) hangs {height:.3g} above where clay rests, "
-                f"{floor_height(scene):.3g}, and " + ("only tools can hold it there." if held else "no tools can hold it there."),
-                "Lower the goal by that much, or raise the floor (ground_height)"
-                + ("; keep it if the tools are to lift the clay." if held else "."),
-            )
+        if len(particles) >= LEAST_PART * len(goal) and height > free and not _near_fixed_tool(scene, particles, free):
+            heights.append(height)
+            share += len(particles) / len(goal)
+    if not heights:
+        return []
+    held = _can_grip(scene)
+    span = f"{min(heights):.3g}" if len(heights) == 1 else f"{min(heights):.3g} to {max(heights):.3g}"
+    return [
+        Finding(
+            "note" if held else "warning",
+            "goal floating",
+            "target",
+            f"{share:.0%} of the goal hangs {span} above where clay rests, {floor_height(scene):.3g}, and "
+            + ("only tools can hold it there." if held else "no tools can hold it there."),
+            "Lower the goal by that much, or raise the floor (ground_height)"
+            + ("; keep it if the tools are to lift the clay." if held else "."),
         )
-    return findings
+    ]
 
 
 def check_goal_below_floor(scene: Scene, clay: NDArray[np.float64], goal: NDArray[np.float64]) -> list[Finding]:

@@ -9,22 +9,23 @@ FILLED = 2.5
 """Gaps between particles are filled up to this many times the typical distance of neighbours, to both sides."""
 VOXELS = 4
 """Voxels along that distance."""
-FINEST = 1.0 / 200.0
-"""The least edge of a voxel, length units: memory grows with its third power."""
+MOST_VOXELS = 8e6
+"""About as many voxels are looked at, at the most; at 25 bytes each."""
 NEIGHBOURS = 8
 
 
 def filling_radius(*clouds: NDArray[np.float64]) -> float:
-    """A radius of `filled_volume` that leaves no holes inside any of the clouds (N, 3), each of at least two particles, length units."""
+    """A radius of `filled_volume` that leaves no holes inside any of the clouds (N, 3) of at least two particles, length units."""
     from scipy.spatial import KDTree
 
-    spacings = []
+    spacings, boxes = [], []
     for positions in clouds:
+        boxes.append(float(np.prod(np.ptp(positions, axis=0))))
         some = positions[:: max(1, len(positions) // 2000)]
         distances = KDTree(positions).query(some, k=min(NEIGHBOURS, len(positions) - 1) + 1)[0][:, -1]
         # the volume of a ball of NEIGHBOURS particles, as a cube for each
         spacings.append(float(np.percentile(distances, 75)) * (4.0 / 3.0 * np.pi / NEIGHBOURS) ** (1.0 / 3.0))
-    return max(FILLED * max(spacings), VOXELS * FINEST)
+    return float(max(FILLED * max(spacings), VOXELS * (max(boxes) / MOST_VOXELS) ** (1.0 / 3.0)))
 
 
 def filled_volume(positions: NDArray[np.float64], radius: float) -> float:

@@ -28,8 +28,8 @@ def check_tool_speed(scene: Scene) -> list[Finding]:
                     "warning",
                     KIND,
                     f"scene.manipulators.{index}.action_scale",
-                    f"At action 1 this {tool.kind} moves {cells:.3g} grid cells a substep; above {MOST_CELLS:g} it passes through clay "
-                    "instead of pushing it, or the simulation breaks down.",
+                    f"At action 1 this {tool.kind} moves {cells:.3g} grid cells a substep; above {MOST_CELLS:g} it passes through "
+                    "clay instead of pushing it, or the simulation breaks down.",
                     f"Scale its motion by {0.9 * MOST_CELLS / cells:.2g}, or raise substeps.",
                 )
             )

@@ -12,7 +12,7 @@ from cpdeform.tasks.checks.tool_size import bounding_radius, contact_reach, thic
 
 KIND = "tool thickness"
 LEAST_NODES = 2
-"""Node planes that a tool covers wherever it is. One plane alone shares its particles with planes that go on, which lets clay through."""
+"""Node planes that a tool should cover wherever it is. One plane alone shares its particles with planes that let clay through."""
 
 
 def check_tool_thickness(scene: Scene) -> list[Finding]:
@@ -29,8 +29,8 @@ def check_tool_thickness(scene: Scene) -> list[Finding]:
                     "error",
                     KIND,
                     where,
-                    f"This fixed {tool.kind} can never be felt: it covers none of the grid's nodes, {scene.node_distance:.4g} apart, "
-                    f"where alone tools act.",
+                    f"This fixed {tool.kind} can never be felt: it covers none of the grid's nodes, "
+                    f"{scene.node_distance:.4g} apart, where alone tools act.",
                     f"Make it at least {least:.4g} thick (it is {thickness(tool):.4g}), move it into the domain, "
                     "or take a finer grid (grid_size).",
                 )

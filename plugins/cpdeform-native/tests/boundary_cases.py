@@ -52,9 +52,7 @@ def make_scene() -> Any:
     """One tool of each kind: 6 + 6 + 6 + 6 + 6 + 3 + 7 actions."""
     scene = _simulator.Scene(**scene_arguments())
     for kind, actions in enumerate((6, 6, 6, 6, 6, 3, 7)):
-        scene.add_tool(
-            **tool_arguments(kind=kind, size=(0.05, 0.04, 0.03, 0.01), action_size=actions, scale=(0.01,) * actions)
-        )
+        scene.add_tool(**tool_arguments(kind=kind, size=(0.05, 0.04, 0.03, 0.01), action_size=actions, scale=(0.01,) * actions))
     return scene
 
 

@@ -6,6 +6,7 @@ Prints a line before each case, and one with the time of the clock `time.monoton
 from __future__ import annotations
 
 import signal
+import sys
 import time
 from collections.abc import Callable
 
@@ -59,21 +60,26 @@ CASES: dict[str, Callable[[], Callable[[], object]]] = {
 }
 
 
+def say(line: object) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
 def main() -> None:
     # the parent may ignore the signal, as what a script starts in the background does
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for name, make in CASES.items():
         work = make()
         try:
-            print(f"busy: {name}", flush=True)
+            say(f"busy: {name}")
             work()
-            print(f"ended by itself: {name}", flush=True)
+            say(f"ended by itself: {name}")
         except KeyboardInterrupt:
-            print(time.monotonic(), flush=True)
+            say(time.monotonic())
     made = simulator(500, worlds=3)
     state, actions = made.initial_state(batch_size=3), torch.zeros(3, 1, 0)
     first, again = (made.rollout(state, actions).positions for _ in range(2))
-    print("equal" if torch.equal(first, again) else "different", flush=True)
+    say("equal" if torch.equal(first, again) else "different")
 
 
 if __name__ == "__main__":
