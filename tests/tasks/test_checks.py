@@ -69,6 +69,10 @@ def box_points(position: tuple[float, float, float], widths: tuple[float, float,
     return np.asarray(position) + np.random.default_rng(0).uniform(-0.5, 0.5, (count, 3)) * np.asarray(widths)
 
 
+def moved(points: Any, *by: float) -> Any:
+    return points + np.asarray(by)
+
+
 def task_with(tmp_path: Path, scene: Scene, goal: Any, **changes: Any) -> Task:
     np.savez(tmp_path / "goal.npz", position=goal)
     return Task(name="checked", scene=scene, target=tmp_path / "goal.npz", **changes)
@@ -244,7 +248,7 @@ def test_a_floating_goal_needs_something_to_hold_it() -> None:
     assert check_goal_floating(scene_with(ball, stand), hanging) == []
     assert check_goal_floating(scene_with(ball, ground_height=0.27), hanging) == []
     assert check_goal_floating(scene_with(ball, gravity_parameter=(0.0, 0.0, 0.0)), hanging) == []
-    resting = np.concatenate([hanging - [0.0, 0.25, 0.0], hanging + [0.3, 0.0, 0.0]])
+    resting = np.concatenate([moved(hanging, 0.0, -0.25, 0.0), moved(hanging, 0.3, 0.0, 0.0)])
     assert "50%" in only(check_goal_floating(scene_with(ball), resting)).what
 
 
@@ -254,13 +258,13 @@ def test_a_goal_below_the_floor_is_told_of_unless_clay_starts_there() -> None:
     finding = only(check_goal_below_floor(scene, high, goal))
     assert "0.0469" in finding.what
     assert check_goal_below_floor(scene, low, goal) == []
-    assert check_goal_below_floor(scene, high, goal + [0.0, 0.047, 0.0]) == []
+    assert check_goal_below_floor(scene, high, moved(goal, 0.0, 0.047, 0.0)) == []
 
 
 def test_a_goal_out_of_reach_is_told_of(tmp_path: Path) -> None:
     ball = {"kind": "Sphere", "radius": 0.03, "action_scale": (0.01, 0.01, 0.01)}
     clay = sample_particles(scene_with(ball))
-    goal = clay + [0.2, 0.0, 0.0]
+    goal = moved(clay, 0.2, 0.0, 0.0)
     bounded = task_with(tmp_path, scene_with({**ball, "upper_bound": (0.4, 1.0, 1.0)}), goal, step_count=50)
     assert only(check_goal_reach(bounded, clay, goal)).where == "scene.manipulators"
     short = task_with(tmp_path, scene_with(ball), goal, step_count=5)
@@ -292,7 +296,7 @@ def test_the_tasks_that_come_with_it_have_no_fault(name: str) -> None:
 
 def test_the_command_line_tells_all_and_fails(tmp_path: Path) -> None:
     scene = scene_with(THIN["plate"], {"kind": "Sphere", "radius": 0.03, "action_scale": (1.0, 1.0, 1.0)})
-    np.savez(tmp_path / "goal.npz", position=sample_particles(scene) + [0.0, 0.1, 0.0])
+    np.savez(tmp_path / "goal.npz", position=moved(sample_particles(scene), 0.0, 0.1, 0.0))
     content = {"name": "faulty", "scene": scene.model_dump(mode="json"), "target": "goal.npz"}
     (tmp_path / "faulty.yaml").write_text(json.dumps(content))
     result = CliRunner().invoke(app, ["task", "check", str(tmp_path / "faulty.yaml"), "--json"])

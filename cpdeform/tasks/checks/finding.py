@@ -6,7 +6,7 @@ import dataclasses
 from typing import Literal
 
 Severity = Literal["error", "warning", "note"]
-"""``"error"``: the task cannot do what it is meant to; ``"warning"``: it hardly will; ``"note"``: it will, if that is what is meant."""
+"""``"error"``: the task cannot do what it is meant to; ``"warning"``: it hardly will; ``"note"``: it will, if that is meant."""
 
 
 @dataclasses.dataclass(frozen=True)
