@@ -15,6 +15,7 @@ from cpdeform.core.configuration import (
     with_task_settings,
 )
 from cpdeform.core.errors import InputError, UnknownNameError
+from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.hook_observer import HookObserver
 from cpdeform.core.metrics import target_mass_grid
 from cpdeform.core.objective import Objective
@@ -83,6 +84,7 @@ def deform(
         InputError: A name, an option or the task cannot be used.
         CapabilityError: The parts do not fit together.
     """
+    prepare_for_forks()
     registry = registry or load_registry()
     if isinstance(simulator, str):
         simulator = registry.resolve("simulator", simulator, device=device)
@@ -182,6 +184,7 @@ def deform_configuration(
         InputError: A name, an option or the task cannot be used.
         CapabilityError: The parts do not fit together.
     """
+    prepare_for_forks()
     registry = registry or load_registry()
     check_names(configuration, registry=registry)
     task = configured_task(configuration, registry=registry) if resumption is None else resumption.task

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import CapabilityError, InputError
+from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.scene import Scene
 from cpdeform.core.state import State, initial_state
 
@@ -95,6 +96,7 @@ class Simulator(abc.ABC):
     def __init__(
         self, scene: Scene, *, batch_size: int = 1, device: torch.device | str = "cpu", dtype: torch.dtype | None = None
     ) -> None:
+        prepare_for_forks()
         self.scene = scene
         self.batch_size = batch_size
         self.device = torch.device(device)

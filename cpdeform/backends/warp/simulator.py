@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any, ClassVar, TypeVar
 
@@ -22,6 +21,7 @@ from cpdeform.backends.warp.kernels_transfer import build_transfer
 from cpdeform.backends.warp.kernels_types import build_types
 from cpdeform.backends.warp.lane import Lane, Particles, Program, Substep
 from cpdeform.backends.warp.scene_arrays import make_constants, make_parameters, make_tools
+from cpdeform.core.forking import LocalThreads
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import RolloutGradient, SimulatorCapabilities, Trajectory
 from cpdeform.core.state import State
@@ -91,7 +91,7 @@ class SimulatorWarp(SimulatorCheckpointing):
         self._real = wp.float64 if self.dtype is torch.float64 else wp.float32
         self._types = build_types(self._real)
         self._program = self._make_program()
-        self._pool = ThreadPoolExecutor(self.threads) if self.device.type == "cpu" and self.threads > 1 else None
+        self._pool = LocalThreads(self.threads) if self.device.type == "cpu" and self.threads > 1 else None
         self._done: torch.cuda.Event | None = None
         captured = graphs and self.device.type == "cuda"
         self._slots = self._make_slots(capture_on_cuda(self.device)) if captured else None
