@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar, TypeVar
 
@@ -13,6 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from cpdeform.backends.checkpointing import SimulatorCheckpointing
+from cpdeform.backends.kernel_cache import cache_folder, user_cache
 from cpdeform.backends.scene_numbers import KIND_NUMBERS
 from cpdeform.backends.warp.graph import Capture, Graphs, Lease, RolloutSlot, SlotKey, SlotPool, capture_on_cuda
 from cpdeform.backends.warp.kernels_grid import build_grid
@@ -374,4 +377,10 @@ def _initialize_warp() -> None:
     """Start Warp without its banner and its line per loaded module, unless the user asked for more than the default."""
     if wp.config.log_level == wp.LOG_INFO:
         wp.config.log_level = wp.LOG_WARNING
+    if wp.config.kernel_cache_dir is None:
+        setting = "WARP_CACHE_PATH"
+        usual = Path(os.environ[setting]) if setting in os.environ else user_cache() / "warp"
+        chosen = cache_folder(usual, setting=setting)
+        if chosen != usual:
+            wp.config.kernel_cache_dir = str(chosen)
     wp.init()
