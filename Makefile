@@ -9,7 +9,9 @@ NATIVE_SOURCES := $(shell find plugins/cpdeform-native -name '*.cpp' -o -name '*
 COMPILER := $(shell command -v $${CXX:-c++} 2>/dev/null)
 OUT ?= runs/first
 
-.PHONY: run test quick lint targets clean
+SANITIZED := plugins/cpdeform-native/build/sanitized
+
+.PHONY: run test quick lint targets sanitize clean
 
 run: $(NATIVE)
 	$(BIN)/cpdeform run writer --out $(OUT) --overwrite
@@ -36,6 +38,20 @@ lint: $(INSTALLED)
 TARGETS ?=
 targets: $(NATIVE)
 	$(BIN)/python -m cpdeform.tasks.make_targets --check $(TARGETS)
+
+# The C++ code under AddressSanitizer and UndefinedBehaviorSanitizer: arguments of all sorts, right and wrong, and a few rollouts,
+# gradients and transports. Python is not built with them, so their runtime has to be loaded first; what Python never frees is no leak.
+SANITIZE_TESTS := tests/test_boundary.py tests/test_sanitized.py
+sanitize: $(NATIVE)
+ifeq ($(COMPILER),)
+	@echo "No C++ compiler was found: there is nothing to check."
+else
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pip install --quiet --no-build-isolation --no-deps --upgrade --target $(SANITIZED) \
+		-C cmake.define.CPDEFORM_SANITIZE=ON -C build-dir=build/sanitize plugins/cpdeform-native
+	cd plugins/cpdeform-native && CPDEFORM_NATIVE_BUILD=$(CURDIR)/$(SANITIZED) ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+		LD_PRELOAD="$$($(COMPILER) -print-file-name=libasan.so) $$($(COMPILER) -print-file-name=libstdc++.so.6)" \
+		../../$(BIN)/python -m pytest -p no:cacheprovider $(SANITIZE_TESTS)
+endif
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

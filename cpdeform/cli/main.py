@@ -17,13 +17,14 @@ from cpdeform.cli.experiment import experiment
 from cpdeform.cli.plugins import plugins
 from cpdeform.cli.run import run
 from cpdeform.cli.strategies import strategies
+from cpdeform.cli.system_limits import system_limit
 from cpdeform.cli.task import task
 from cpdeform.cli.tasks import tasks
 from cpdeform.core.errors import CpdeformError
 
 
 class ErrorGroup(TyperGroup):
-    """Commands whose deliberate errors are one message on stderr and exit code 2; anything else is a bug and keeps its trace."""
+    """Commands whose deliberate errors, and limits of the system, are one message on stderr and exit code 2; all else is a bug."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
@@ -33,6 +34,11 @@ class ErrorGroup(TyperGroup):
                 return super().invoke(ctx)
         except CpdeformError as error:
             typer.echo(f"cpdeform: error: {error}", err=True)
+            raise typer.Exit(2) from error
+        except OSError as error:
+            if (line := system_limit(error)) is None:
+                raise
+            typer.echo(f"cpdeform: error: {line}", err=True)
             raise typer.Exit(2) from error
         except KeyboardInterrupt as error:
             typer.echo("cpdeform: interrupted", err=True)

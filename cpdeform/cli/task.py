@@ -1,4 +1,4 @@
-"""`cpdeform task`: files that tasks are made of."""
+"""`cpdeform task`: checks of tasks, and files that they are made of."""
 
 from __future__ import annotations
 
@@ -7,15 +7,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cpdeform.cli.task_check import task_check_command
+
 if TYPE_CHECKING:
     from cpdeform.tasks.grid_import import ImportedGrid
 
-task = typer.Typer(no_args_is_help=True, help="Make files that tasks are made of.")
+task = typer.Typer(no_args_is_help=True, help="Check tasks, and make files that they are made of.")
 
 
 @task.callback()
 def task_group() -> None:
-    """Make files that tasks are made of."""
+    """Check tasks, and make files that they are made of."""
+
+
+task.command("check")(task_check_command)
 
 
 @task.command("import-grid")

@@ -83,6 +83,11 @@ class TransportProblem:
     blur: float = 5e-3
 
 
+LEAST_RELATIVE_BLUR = 1e-6
+"""The least entropic blur as a part of the points' span. Costs of size (span / blur)^p, in units of the temperature, leave double
+precision hardly any digits below."""
+
+
 class OTSolver(abc.ABC):
     """Solves optimal transport between two weighted particle clouds."""
 
@@ -111,7 +116,8 @@ class OTSolver(abc.ABC):
             Value, potentials and gradient, detached, on the device and in the type of `source`.
 
         Raises:
-            InputError: Shapes, devices or weights do not fit, or a number is not finite.
+            InputError: Shapes, devices or weights do not fit, a number is not finite, or the blur is next to nothing against the
+                points' span (`check_blur`).
         """
 
     def solve_batch(self, sources: Tensor, target: Tensor, *, previous: Sequence[OTResult | None] | None = None) -> list[OTResult]:
@@ -170,6 +176,29 @@ def check_problem(
             "target", came=f"{target.dtype} on {target.device}", expected=f"{source.dtype} on {source.device}, as the source"
         )
     return _check_weights("source_weights", source_weights, source), _check_weights("target_weights", target_weights, target)
+
+
+def check_blur(blur: float, source: Tensor, target: Tensor) -> None:
+    """Refuse a blur that is next to nothing against the points: no solver could resolve it, and some would never end.
+
+    Args:
+        blur: Entropic blur, length units.
+        source: Finite source positions (N, 3), length units.
+        target: Finite target positions (M, 3), length units.
+
+    Raises:
+        InputError: The blur is below `LEAST_RELATIVE_BLUR` of the diagonal of the box around all points.
+    """
+    low = torch.minimum(source.amin(dim=0), target.amin(dim=0)).double()
+    high = torch.maximum(source.amax(dim=0), target.amax(dim=0)).double()
+    span = float((high - low).norm())
+    if not blur >= LEAST_RELATIVE_BLUR * span:
+        raise InputError(
+            "blur",
+            came=f"{blur:g} for points that span {span:g}",
+            expected=f"at least {LEAST_RELATIVE_BLUR * span:g}, a millionth of the span",
+            remedy="Usual values lie between 1e-3 and 1e-2 of a domain edge; positions are in domain edges.",
+        )
 
 
 def _check_weights(name: str, weights: Tensor | None, points: Tensor) -> Tensor:

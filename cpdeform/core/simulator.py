@@ -15,6 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.final_gradient import pull_back, state_tensors
+from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator_inputs import check_values
 from cpdeform.core.state import State, initial_state
@@ -99,6 +100,7 @@ class Simulator(abc.ABC):
     def __init__(
         self, scene: Scene, *, batch_size: int = 1, device: torch.device | str = "cpu", dtype: torch.dtype | None = None
     ) -> None:
+        prepare_for_forks()
         self.scene = scene
         self.batch_size = batch_size
         self.device = torch.device(device)

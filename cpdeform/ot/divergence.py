@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.ot import OTResult, check_problem, fix_gauge
+from cpdeform.core.ot import OTResult, check_blur, check_problem, fix_gauge
 from cpdeform.ot.softmin import soft_minimum, soft_minimum_gradient
 
 
@@ -63,6 +63,7 @@ class Problem:
     ) -> Problem:
         """Check the arguments of `OTSolver.solve` and gather them."""
         first, second = check_problem(source, target, source_weights, target_weights)
+        check_blur(blur, source, target)
         return cls(Side.of(source, first), Side.of(target, second), blur**exponent, exponent)
 
     def diameter(self) -> float:

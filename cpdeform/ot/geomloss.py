@@ -10,6 +10,7 @@ from geomloss import SamplesLoss
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.ot import OTCapabilities, OTResult, OTSolver, fix_gauge
 from cpdeform.ot.annealing import Schedule, solve_cold
 from cpdeform.ot.divergence import Potentials, Problem, check_choice, check_options, finish, usable_state, warm_potentials
@@ -78,6 +79,7 @@ class OTSolverGeomLoss(OTSolver):
         iterations: int = 3000,
         warm_iterations: int = 1,
     ) -> None:
+        prepare_for_forks()
         check_options(blur=blur, exponent=exponent, tolerance=tolerance, iterations=iterations, warm_iterations=warm_iterations)
         check_choice("settings", settings, ("converged", "paper"))
         if not 0 < scaling < 1:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.ot import OTCapabilities, OTResult, OTSolver
 from cpdeform.ot.annealing import Schedule, solve_cold
 from cpdeform.ot.divergence import Problem, check_choice, check_options, finish, usable_state, warm_potentials
@@ -82,6 +83,7 @@ class OTSolverPOT(OTSolver):
         iterations: int = 3000,
         warm_iterations: int = 1,
     ) -> None:
+        prepare_for_forks()
         check_options(blur=blur, exponent=exponent, tolerance=tolerance, iterations=iterations, warm_iterations=warm_iterations)
         check_choice("value", value, ("entropic", "exact"))
         check_choice("method", method, ("sinkhorn_stabilized", "sinkhorn_log"))

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from pydantic import Field, PositiveFloat, field_validator
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.ot import LEAST_RELATIVE_BLUR
 from cpdeform.core.plugins import AUTO
 from cpdeform.core.scene import FrozenModel
 from cpdeform.planning.objectives.contact import ContactKind
@@ -35,13 +36,13 @@ class PrioritiesConfiguration(FrozenModel):
         kind: ``"potential"``: the dual potentials of the cost |x - y| (the paper); ``"displacement"``: the distance that transport
             of the cost |x - y|^2 moves each particle, from a solver with an option `exponent`. See
             `cpdeform.core.priorities.transport_priorities`. Defaults to what the placer declares (`Placer.transport_problem`).
-        blur: Entropic blur of the transport problem, length units; defaults to what the placer declares. The larger, the quicker
-            and the smoother; up to half a centimetre the potentials' peak stays at the particles that have to move, displacements
-            allow for two.
+        blur: Entropic blur of the transport problem, length units, at least a millionth of the domain's edge; defaults to what the
+            placer declares. The larger, the quicker and the smoother; up to half a centimetre the potentials' peak stays at the
+            particles that have to move, displacements allow for two.
     """
 
     kind: Literal["potential", "displacement"] | None = None
-    blur: float | None = Field(default=None, gt=0.0)
+    blur: float | None = Field(default=None, ge=LEAST_RELATIVE_BLUR)
 
 
 class ObjectiveConfiguration(FrozenModel):
@@ -51,7 +52,7 @@ class ObjectiveConfiguration(FrozenModel):
         kind: ``"transport"``: transport cost between the last step's particles and the goal (the paper); ``"plasticinelab"``:
             density, distance and contact terms of node masses, summed over all steps.
         points: Particles that the transport loss is computed on, a fixed random subset; None for all.
-        blur: Entropic blur of the transport loss, length units.
+        blur: Entropic blur of the transport loss, length units; at least a millionth of the domain's edge.
         refresh: Solve from scratch every so many evaluations, warm-started between.
         contact_weight: Weight of PlasticineLab's contact term, which draws tools to the body; where absent 0 for ``"transport"``
             and 1 for ``"plasticinelab"``.
@@ -64,7 +65,7 @@ class ObjectiveConfiguration(FrozenModel):
 
     kind: Literal["transport", "plasticinelab"] = "transport"
     points: int | None = Field(default=10000, ge=1)
-    blur: float = Field(default=2e-3, gt=0.0)
+    blur: float = Field(default=2e-3, ge=LEAST_RELATIVE_BLUR)
     refresh: int = Field(default=50, ge=1)
     contact_weight: float | None = Field(default=None, ge=0.0)
     coast_steps: float = Field(default=0.0, ge=0.0)

@@ -61,9 +61,9 @@ def check_directory(directory: Path, *, overwrite: bool) -> None:
         InputError: It is a file, is not empty, or cannot be made or written to.
     """
     argument = f"output directory {directory}"
-    if directory.exists() and not directory.is_dir():
-        raise InputError(argument, came="a file", expected="a directory, or a path that does not exist yet")
     try:
+        if directory.exists() and not directory.is_dir():
+            raise InputError(argument, came="a file", expected="a directory, or a path that does not exist yet")
         if not overwrite and directory.is_dir() and any(directory.iterdir()):
             raise InputError(
                 argument,

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.objective import Objective
 from cpdeform.core.ot import OTSolver
 from cpdeform.core.placer import Placer
@@ -22,6 +23,7 @@ from cpdeform.planning.algorithm import Planner
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.result import Observer, StageResult
 from cpdeform.planning.strategy import Parts, Strategy
+from cpdeform.run.checks.check import warn_about_tools
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.hook_observer import HookObserver
 from cpdeform.run.parts import (
@@ -111,6 +113,8 @@ class ResolvedRun:
             MissingExtraError: A part's optional dependency is not installed.
         """
         configuration, registry, objects, task = self.configuration, self.registry, self.objects, self.task
+        prepare_for_forks()
+        warn_about_tools(task.scene)
         placer = objects.placer
         if placer is None:
             named = registry.create("placer", configuration.placer, **configuration.placer_options)

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from children import interruptible_command, interrupts_ignored
 from toy_fixtures import TOYS
 from typer.testing import CliRunner
 
@@ -272,10 +273,11 @@ def test_interruption(directory, toy_distribution):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TOYS), str(toy_distribution)])}
     arguments = ["run", "shift.yaml", *PARTS[:-1], "100000", "--out", "run", "--set", "simulator_options.delay=0.01"]
     arguments += ["--set", "optimizer.patience=100000"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "cpdeform.cli.main", *arguments],
-        env=environment, cwd=directory, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    with interrupts_ignored():
+        process = subprocess.Popen(
+            interruptible_command(arguments),
+            env=environment, cwd=directory, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
     metrics, limit = directory / "run" / "metrics.jsonl", time.monotonic() + SECONDS_TO_WAIT
     while not (metrics.exists() and metrics.stat().st_size) and time.monotonic() < limit and process.poll() is None:
         time.sleep(0.02)

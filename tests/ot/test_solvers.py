@@ -389,3 +389,18 @@ def test_plugin_registers_both_solvers() -> None:
         "pot": "cpdeform.ot.pot:OTSolverPOT",
         "geomloss": "cpdeform.ot.geomloss:OTSolverGeomLoss",
     }
+
+
+@pytest.mark.parametrize(("blur", "scale"), [(1e-30, 1.0), (1e-8, 1.0), (1e-3, 1e18)])
+def test_a_blur_next_to_nothing_is_refused_instead_of_solved_for_ever(make: MakeSolver, blur: float, scale: float) -> None:
+    source, target = scale * cloud(20, 1), scale * cloud(20, 2)
+    with pytest.raises(InputError, match=r"^blur: got .* for points that span .*expected at least .*Usual values"):
+        make(blur=blur).solve(source, target)
+
+
+def test_the_least_blur_is_solved(make: MakeSolver) -> None:
+    source, target = cloud(20, 1), cloud(20, 2)
+    result = make(blur=1e-6, iterations=100).solve(source, target)
+    cost = torch.cdist(source, target).numpy()
+    weights = [1.0 / 20] * 20
+    assert float(result.value) == pytest.approx(ot.emd2(weights, weights, cost), rel=1e-3)

@@ -214,3 +214,9 @@ def test_records_of_the_first_format_are_read(tmp_path, task, toy_entry_points):
     assert {"proposers", "rounds"} < set(found.placer_options)
     assert (found.placer_options["proposers"], found.placer_options["rounds"]) == (["direct"], 5)
     assert found.priorities.blur == 0.004
+
+
+@pytest.mark.parametrize("section", ["priorities", "objective"])
+def test_a_blur_next_to_nothing_is_refused(section, registry):
+    with pytest.raises(InputError, match=rf"{section}\.blur: got 1e-30, expected .* 0\.000001"):
+        resolve({section: {"blur": 1e-30}}, registry=registry)

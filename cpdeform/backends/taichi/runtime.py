@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 
+from cpdeform.backends.kernel_cache import cache_folder, user_cache
 from cpdeform.core.errors import CapabilityError, CpdeformError
 from cpdeform.core.machine import available_cores
 
@@ -58,6 +59,13 @@ def _quietly() -> Iterator[None]:
                 os.environ.pop(name, None)
 
 
+def _give_it_a_home() -> None:
+    """Taichi ends the process where neither variable tells where its cache is; the system's user database does."""
+    if "HOME" not in os.environ and "XDG_CACHE_HOME" not in os.environ:
+        os.environ["XDG_CACHE_HOME"] = str(cache_folder(user_cache(), setting="XDG_CACHE_HOME"))
+
+
+_give_it_a_home()
 with _quietly(), warnings.catch_warnings():
     warnings.filterwarnings("ignore", category=DeprecationWarning, module=r"taichi\.")
     import taichi as ti

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any, Protocol
 
 import warp as wp
+
+from cpdeform.core.forking import LocalThreads
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +119,7 @@ class Lane:
         *,
         worlds: int,
         particle_count: int,
-        pool: ThreadPoolExecutor | None = None,
+        pool: LocalThreads | None = None,
         blocks: int = 1,
         arrays: Arrays | None = None,
         full_grid: bool = False,

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar, TypeVar
 
@@ -14,6 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from cpdeform.backends.checkpointing import SimulatorCheckpointing
+from cpdeform.backends.kernel_cache import cache_folder, user_cache
 from cpdeform.backends.warp.graph import Capture, Graphs, Lease, RolloutSlot, SlotKey, SlotPool, capture_on_cuda
 from cpdeform.backends.warp.kernels_distance import MANIPULATOR_KINDS
 from cpdeform.backends.warp.kernels_grid import build_grid
@@ -22,6 +24,7 @@ from cpdeform.backends.warp.kernels_transfer import build_transfer
 from cpdeform.backends.warp.kernels_types import build_types
 from cpdeform.backends.warp.lane import Lane, Particles, Program, Substep
 from cpdeform.backends.warp.scene_arrays import make_constants, make_parameters, make_tools
+from cpdeform.core.forking import LocalThreads
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import RolloutGradient, SimulatorCapabilities, Trajectory
 from cpdeform.core.state import State
@@ -106,7 +109,7 @@ class SimulatorWarp(SimulatorCheckpointing):
         self._real = wp.float64 if self.dtype is torch.float64 else wp.float32
         self._types = build_types(self._real)
         self._program = self._make_program()
-        self._pool = ThreadPoolExecutor(self.threads) if self.device.type == "cpu" and self.threads > 1 else None
+        self._pool = LocalThreads(self.threads) if self.device.type == "cpu" and self.threads > 1 else None
         self._done: torch.cuda.Event | None = None
         captured = graphs and self.device.type == "cuda"
         self._slots = self._make_slots(capture_on_cuda(self.device)) if captured else None
@@ -400,4 +403,10 @@ def _initialize_warp() -> None:
     """Start Warp without its banner and its line per loaded module, unless the user asked for more than the default."""
     if wp.config.log_level == wp.LOG_INFO:
         wp.config.log_level = wp.LOG_WARNING
+    if wp.config.kernel_cache_dir is None:
+        setting = "WARP_CACHE_PATH"
+        usual = Path(os.environ[setting]) if setting in os.environ else user_cache() / "warp"
+        chosen = cache_folder(usual, setting=setting)
+        if chosen != usual:
+            wp.config.kernel_cache_dir = str(chosen)
     wp.init()

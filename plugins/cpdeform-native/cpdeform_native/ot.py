@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError, MissingExtraError
+from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.machine import available_cores
 from cpdeform.core.ot import OTCapabilities, OTResult, OTSolver, fix_gauge
 from cpdeform.ot.divergence import Potentials, Problem, check_options, usable_state
@@ -127,6 +128,7 @@ class OTSolverNative(OTSolver):
         threads: int | None = None,
         instruction_set: str | None = None,
     ) -> None:
+        prepare_for_forks()
         check_options(blur=blur, exponent=exponent, tolerance=tolerance, iterations=iterations, warm_iterations=warm_iterations)
         for name, value in (("scaling", scaling), ("warm_tolerance", warm_tolerance)):
             if not 0 < value < 1:

@@ -12,6 +12,9 @@ namespace cpdeform {
 
 namespace {
 
+// Between two questions whether a call is to end: short for a person, long for a computer.
+constexpr std::chrono::milliseconds question_interval{20};
+
 void pause_briefly() {
 #if defined(__x86_64__)
   _mm_pause();
@@ -20,7 +23,12 @@ void pause_briefly() {
 
 }  // namespace
 
-Team::Team(int threads) : size_(threads < 1 ? 1 : threads) {}
+const char* Interrupted::what() const noexcept { return "interrupted"; }
+const char* Abandoned::what() const noexcept { return "another thread failed"; }
+void throw_interrupted() { throw Interrupted(); }
+void Team::abandon() { throw Abandoned(); }
+
+Team::Team(int threads, Asker asker) : size_(threads < 1 ? 1 : threads), asker_(asker) {}
 
 Team::~Team() {
   if (!shared_ || process_ != static_cast<long>(getpid())) return;
@@ -39,7 +47,7 @@ void Team::start() {
   process_ = process;
   shared_ = new Shared;
   arrived_.store(0);
-  for (int thread = 1; thread < size_; ++thread) shared_->workers.emplace_back(loop, std::ref(*shared_), thread);
+  for (int thread = 1; thread < size_; ++thread) shared_->workers.emplace_back(&Team::loop, this, std::ref(*shared_), thread);
 }
 
 void Team::loop(Shared& shared, int thread) {
@@ -53,26 +61,63 @@ void Team::loop(Shared& shared, int thread) {
       seen = shared.generation;
       work = shared.work;
     }
-    std::exception_ptr error;
-    try {
-      (*work)(thread);
-    } catch (...) {
-      error = std::current_exception();
-    }
+    const std::exception_ptr error = guarded(*work, thread);
     std::lock_guard<std::mutex> lock(shared.mutex);
     if (error && !shared.error) shared.error = error;
     if (--shared.running == 0) shared.done.notify_all();
   }
 }
 
+// One thread's share of a call. A thread that fails leaves no other waiting at a barrier. Returns its exception.
+std::exception_ptr Team::guarded(const std::function<void(int)>& work, int thread) {
+  try {
+    work(thread);
+    return nullptr;
+  } catch (const Abandoned&) {
+    return nullptr;
+  } catch (...) {
+    broken_.store(true, std::memory_order_release);
+    round_.fetch_add(1, std::memory_order_release);
+    round_.notify_all();
+    return std::current_exception();
+  }
+}
+
+bool Team::interrupted(int thread) {
+  if (thread == 0 && asker_ && !ending_.load(std::memory_order_relaxed)) {
+    const auto now = std::chrono::steady_clock::now();
+    if (now >= next_question_) {
+      next_question_ = now + question_interval;
+      if (asker_()) ending_.store(true, std::memory_order_relaxed);
+    }
+  }
+  return ending_.load(std::memory_order_relaxed);
+}
+
+void Team::take_turn() {
+  while (!calls_.try_lock_for(question_interval))
+    if (asker_ && asker_()) throw_interrupted();
+}
+
 void Team::run(const std::function<void(int)>& work) {
-  std::lock_guard<std::mutex> turn(calls_);
+  take_turn();
+  std::lock_guard<std::timed_mutex> turn(calls_, std::adopt_lock);
+  ending_.store(false);
+  next_question_ = {};
   if (size_ == 1) {
     work(0);
-    return;
+  } else {
+    run_with_workers(work);
   }
+  // the asker may have said so when the work was done: it has been heard all the same
+  if (ending_.load()) throw_interrupted();
+}
+
+void Team::run_with_workers(const std::function<void(int)>& work) {
   start();
   Shared& shared = *shared_;
+  broken_.store(false);
+  arrived_.store(0);
   {
     std::lock_guard<std::mutex> lock(shared.mutex);
     shared.work = &work;
@@ -81,25 +126,23 @@ void Team::run(const std::function<void(int)>& work) {
     ++shared.generation;
   }
   shared.wake.notify_all();
-  std::exception_ptr mine;
-  try {
-    work(0);
-  } catch (...) {
-    mine = std::current_exception();
-  }
+  const std::exception_ptr mine = guarded(work, 0);
   std::unique_lock<std::mutex> lock(shared.mutex);
-  shared.done.wait(lock, [&] { return shared.running == 0; });
+  while (!shared.done.wait_for(lock, question_interval, [&] { return shared.running == 0; })) {
+    lock.unlock();
+    interrupted(0);
+    lock.lock();
+  }
+  if (ending_.load()) throw_interrupted();
   if (mine) std::rethrow_exception(mine);
   if (shared.error) std::rethrow_exception(shared.error);
 }
 
 void Team::wait_for_round(unsigned round) {
   // phases take tens of microseconds: spin that long before asking the system to wait
-  for (int spin = 0; spin < 4000; ++spin) {
-    if (round_.load(std::memory_order_acquire) != round) return;
-    pause_briefly();
-  }
+  for (int spin = 0; spin < 4000 && round_.load(std::memory_order_acquire) == round; ++spin) pause_briefly();
   while (round_.load(std::memory_order_acquire) == round) round_.wait(round, std::memory_order_acquire);
+  if (broken_.load(std::memory_order_acquire)) abandon();
 }
 
 }  // namespace cpdeform

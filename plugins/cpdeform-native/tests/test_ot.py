@@ -239,3 +239,9 @@ def test_missing_compiled_module_names_the_remedy(monkeypatch: pytest.MonkeyPatc
     monkeypatch.delitem(sys.modules, "cpdeform_native.ot")
     with pytest.raises(MissingExtraError, match="pip install"):
         importlib.import_module("cpdeform_native.ot")
+
+
+@pytest.mark.parametrize(("blur", "scale"), [(1e-30, 1.0), (1e-8, 1.0), (1e-3, 1e18)])
+def test_a_blur_next_to_nothing_is_refused_instead_of_solved_for_ever(blur: float, scale: float) -> None:
+    with pytest.raises(InputError, match=r"^blur: got .* for points that span"):
+        OTSolverNative(blur=blur).solve(scale * cloud(20, seed=1), scale * cloud(20, seed=2))

@@ -12,9 +12,12 @@
 #include <string>
 #include <vector>
 
+#include "arrays.h"
+#include "checks.h"
 #include "instruction_sets.h"
 #include "interface.h"
 #include "profile.h"
+#include "signals.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -45,17 +48,11 @@ Engine<Real>* make_engine(InstructionSet set, const Scene& scene, const double* 
   return choose(engines_baseline::make_engine_float, engines_baseline::make_engine_double);
 }
 
-void expect_size(const char* name, size_t came, int64_t expected) {
-  if (came != size_t(expected))
-    throw std::invalid_argument(std::string(name) + ": came " + std::to_string(came) + " numbers, expected " +
-                                std::to_string(expected));
-}
-
 // Everything that a history needs to stay alive.
 template <class Real>
 struct Shared {
   Shared(const Scene& s, const double* material, int threads, InstructionSet set)
-      : scene(s), team(threads), engine(make_engine<Real>(set, s, material, threads)) {}
+      : scene(s), team(threads, signal_came), engine(make_engine<Real>(set, s, material, threads)) {}
   Scene scene;
   Team team;
   std::unique_ptr<Engine<Real>> engine;
@@ -68,12 +65,17 @@ struct Checkpoints {
   int64_t worlds, steps;
 };
 
+// Their products with the counts of a scene stay within 64 bits.
+constexpr int64_t most_worlds = int64_t(1) << 20, most_steps = int64_t(1) << 28;
+
 template <class Real>
 class Simulator {
  public:
   Simulator(const Scene& scene, In<double> material, int threads, const std::string& instruction_set)
       : set_(instruction_set_of(instruction_set)) {
-    expect_size("material", material.size(), 3 * scene.particle_count);
+    check_scene(scene);
+    expect_shape("material", material, {3, scene.particle_count});
+    expect_between("threads", threads, 1, most_threads);
     shared_ = std::make_shared<Shared<Real>>(scene, material.data(), threads, set_);
   }
 
@@ -83,36 +85,40 @@ class Simulator {
                                              In<Real> strain, In<Real> pose, In<Real> actions, Out<Real> positions, Out<Real> poses,
                                              Out<Real> last_velocity, Out<Real> last_affine, Out<Real> last_strain, bool keep) {
     const Scene& s = shared_->scene;
-    const int64_t particles = worlds * s.particle_count, tools = worlds * s.tool_count * pose_size;
-    expect_size("position", position.size(), 3 * particles);
-    expect_size("velocity", velocity.size(), 3 * particles);
-    expect_size("affine", affine.size(), 9 * particles);
-    expect_size("strain", strain.size(), 6 * particles);
-    expect_size("pose", pose.size(), tools);
-    expect_size("actions", actions.size(), worlds * steps * s.action_size);
-    expect_size("positions", positions.size(), 3 * particles * (steps + 1));
-    expect_size("poses", poses.size(), tools * (steps + 1));
-    expect_size("last_velocity", last_velocity.size(), 3 * particles);
-    expect_size("last_affine", last_affine.size(), 9 * particles);
-    expect_size("last_strain", last_strain.size(), 6 * particles);
+    const int64_t n = s.particle_count, tools = s.tool_count, numbers = s.action_size;
+    expect_between("worlds", worlds, 1, most_worlds);
+    expect_between("steps", steps, 0, most_steps);
+    expect_shape("position", position, {worlds, n, 3});
+    expect_shape("velocity", velocity, {worlds, n, 3});
+    expect_shape("affine", affine, {worlds, n, 3, 3});
+    expect_shape("strain", strain, {worlds, n, 6});
+    expect_shape("pose", pose, {worlds, tools, pose_size});
+    expect_shape("actions", actions, {worlds, steps, numbers});
+    expect_shape("positions", positions, {worlds, steps + 1, n, 3});
+    expect_shape("poses", poses, {worlds, steps + 1, tools, pose_size});
+    expect_shape("last_velocity", last_velocity, {worlds, n, 3});
+    expect_shape("last_affine", last_affine, {worlds, n, 3, 3});
+    expect_shape("last_strain", last_strain, {worlds, n, 6});
     const RolloutArguments<Real> arguments = {worlds,           steps,         position.data(), velocity.data(),
                                               affine.data(),    strain.data(), pose.data(),     actions.data(),
                                               positions.data(), poses.data(),  last_velocity.data(),
                                               last_affine.data(), last_strain.data(), keep};
-    nb::gil_scoped_release unlocked;
     auto made = std::make_unique<Checkpoints<Real>>();
     made->shared = shared_;
     made->worlds = worlds;
     made->steps = steps;
-    made->history.reset(shared_->engine->make_history(worlds, steps));
-    shared_->team.run([&](int thread) { shared_->engine->rollout(shared_->team, thread, arguments, *made->history); });
+    unlocked([&] {
+      made->history.reset(shared_->engine->make_history(worlds, steps));
+      shared_->team.run([&](int thread) { shared_->engine->rollout(shared_->team, thread, arguments, *made->history); });
+    });
     return made;
   }
 
   void release_memory() {
-    nb::gil_scoped_release unlocked;
-    shared_->team.run([&](int thread) {
-      if (thread == 0) shared_->engine->release_memory();
+    unlocked([&] {
+      shared_->team.run([&](int thread) {
+        if (thread == 0) shared_->engine->release_memory();
+      });
     });
   }
 
@@ -128,24 +134,24 @@ class Simulator {
            Out<double> grad_pose) {
     const Scene& s = shared_->scene;
     const int64_t worlds = checkpoints.worlds, steps = checkpoints.steps;
-    const int64_t particles = worlds * s.particle_count, tools = worlds * s.tool_count * pose_size;
+    const int64_t n = s.particle_count, tools = s.tool_count, numbers = s.action_size;
     if (checkpoints.shared != shared_) throw std::invalid_argument("checkpoints: made by another simulator");
-    expect_size("actions", actions.size(), worlds * steps * s.action_size);
-    expect_size("grad_positions", grad_positions.size(), 3 * particles * (steps + 1));
-    if (grad_poses) expect_size("grad_poses", grad_poses->size(), tools * (steps + 1));
+    expect_shape("actions", actions, {worlds, steps, numbers});
+    expect_shape("grad_positions", grad_positions, {worlds, steps + 1, n, 3});
+    if (grad_poses) expect_shape("grad_poses", *grad_poses, {worlds, steps + 1, tools, pose_size});
     if (bool(grad_last_velocity) != bool(grad_last_affine) || bool(grad_last_velocity) != bool(grad_last_strain))
       throw std::invalid_argument("grad_last: expected gradients of velocity, affine and strain, or of none");
     if (grad_last_velocity) {
-      expect_size("grad_last_velocity", grad_last_velocity->size(), 3 * particles);
-      expect_size("grad_last_affine", grad_last_affine->size(), 9 * particles);
-      expect_size("grad_last_strain", grad_last_strain->size(), 6 * particles);
+      expect_shape("grad_last_velocity", *grad_last_velocity, {worlds, n, 3});
+      expect_shape("grad_last_affine", *grad_last_affine, {worlds, n, 3, 3});
+      expect_shape("grad_last_strain", *grad_last_strain, {worlds, n, 6});
     }
-    expect_size("grad_actions", grad_actions.size(), worlds * steps * s.action_size);
-    expect_size("grad_position", grad_position.size(), 3 * particles);
-    expect_size("grad_velocity", grad_velocity.size(), 3 * particles);
-    expect_size("grad_affine", grad_affine.size(), 9 * particles);
-    expect_size("grad_strain", grad_strain.size(), 6 * particles);
-    expect_size("grad_pose", grad_pose.size(), tools);
+    expect_shape("grad_actions", grad_actions, {worlds, steps, numbers});
+    expect_shape("grad_position", grad_position, {worlds, n, 3});
+    expect_shape("grad_velocity", grad_velocity, {worlds, n, 3});
+    expect_shape("grad_affine", grad_affine, {worlds, n, 3, 3});
+    expect_shape("grad_strain", grad_strain, {worlds, n, 6});
+    expect_shape("grad_pose", grad_pose, {worlds, tools, pose_size});
     const VjpArguments<Real> arguments = {worlds,
                                           steps,
                                           actions.data(),
@@ -160,8 +166,9 @@ class Simulator {
                                           grad_affine.data(),
                                           grad_strain.data(),
                                           grad_pose.data()};
-    nb::gil_scoped_release unlocked;
-    shared_->team.run([&](int thread) { shared_->engine->vjp(shared_->team, thread, arguments, *checkpoints.history); });
+    unlocked([&] {
+      shared_->team.run([&](int thread) { shared_->engine->vjp(shared_->team, thread, arguments, *checkpoints.history); });
+    });
   }
 
  private:
@@ -175,25 +182,32 @@ void bind(nb::module_& m, const char* name, const char* checkpoints) {
       .def_ro("worlds", &Checkpoints<Real>::worlds)
       .def_ro("steps", &Checkpoints<Real>::steps)
       .def_prop_ro("nbytes", [](const Checkpoints<Real>& c) { return c.history->bytes(); });
+  // as they come: of a copy in another type, results would be lost
+  const auto array = [](const char* argument) { return nb::arg(argument).noconvert(); };
   nb::class_<Simulator<Real>>(m, name)
-      .def(nb::init<const Scene&, In<double>, int, const std::string&>(), "scene"_a, "material"_a, "threads"_a, "instruction_set"_a)
+      .def(nb::init<const Scene&, In<double>, int, const std::string&>(), "scene"_a, array("material"), "threads"_a,
+           "instruction_set"_a)
       .def_prop_ro("instruction_set", &Simulator<Real>::instruction_set)
       .def("release_memory", &Simulator<Real>::release_memory)
       .def("made", &Simulator<Real>::made, "checkpoints"_a)
-      .def("rollout", &Simulator<Real>::rollout, "worlds"_a, "steps"_a, "position"_a, "velocity"_a, "affine"_a, "strain"_a, "pose"_a,
-           "actions"_a, "positions"_a, "poses"_a, "last_velocity"_a, "last_affine"_a, "last_strain"_a, "keep"_a)
-      .def("vjp", &Simulator<Real>::vjp, "checkpoints"_a, "actions"_a, "grad_positions"_a, "grad_poses"_a.none(),
-           "grad_last_velocity"_a.none(), "grad_last_affine"_a.none(), "grad_last_strain"_a.none(), "grad_actions"_a, "grad_position"_a, "grad_velocity"_a, "grad_affine"_a, "grad_strain"_a, "grad_pose"_a);
+      .def("rollout", &Simulator<Real>::rollout, "worlds"_a, "steps"_a, array("position"), array("velocity"), array("affine"),
+           array("strain"), array("pose"), array("actions"), array("positions"), array("poses"), array("last_velocity"),
+           array("last_affine"), array("last_strain"), "keep"_a)
+      .def("vjp", &Simulator<Real>::vjp, "checkpoints"_a, array("actions"), array("grad_positions"), array("grad_poses").none(),
+           array("grad_last_velocity").none(), array("grad_last_affine").none(), array("grad_last_strain").none(),
+           array("grad_actions"), array("grad_position"), array("grad_velocity"), array("grad_affine"), array("grad_strain"),
+           array("grad_pose"));
 }
 
 void copy(const std::vector<double>& from, double* to, size_t size, const char* name) {
-  if (from.size() > size) throw std::invalid_argument(std::string(name) + ": too many numbers");
+  check_numbers(name, from, 0, size);
   for (size_t i = 0; i < size; ++i) to[i] = i < from.size() ? from[i] : 0.0;
 }
 
 void add_tool(Scene& scene, int kind, const std::vector<double>& size, double friction, int action_size,
               const std::vector<double>& scale, const std::vector<double>& lower, const std::vector<double>& upper) {
   if (scene.tool_count == max_tools) throw std::invalid_argument("scene: too many tools");
+  check_tool(kind, size, friction, action_size, scale, lower, upper);
   Tool& tool = scene.tools[scene.tool_count++];
   tool.kind = kind;
   tool.friction = friction;
@@ -233,6 +247,9 @@ NB_MODULE(_simulator, m) {
           [](Scene* scene, double time_step, double node_distance, double particle_mass, const std::vector<double>& gravity,
              double softness, double ground_friction, int ground_nodes, int wall_nodes, const std::vector<double>& lower,
              const std::vector<double>& upper, int grid_size, int substeps, int64_t particle_count) {
+            check_numbers("gravity", gravity, 3, 3);
+            check_numbers("lower", lower, 3, 3);
+            check_numbers("upper", upper, 3, 3);
             new (scene) Scene{};
             scene->time_step = time_step;
             scene->node_distance = node_distance;
@@ -247,6 +264,7 @@ NB_MODULE(_simulator, m) {
             copy(gravity, scene->gravity, 3, "gravity");
             copy(lower, scene->lower, 3, "lower");
             copy(upper, scene->upper, 3, "upper");
+            check_scene(*scene);
           },
           nb::kw_only(), "time_step"_a, "node_distance"_a, "particle_mass"_a, "gravity"_a, "softness"_a, "ground_friction"_a,
           "ground_nodes"_a, "wall_nodes"_a, "lower"_a, "upper"_a, "grid_size"_a, "substeps"_a, "particle_count"_a)

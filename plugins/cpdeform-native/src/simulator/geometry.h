@@ -97,13 +97,16 @@ struct Geometry {
         const Real s = length(q);
         return {q * (1 / s), s - size[1]};
       }
-      default: {
+      case cpdeform::capsule:
+      case cpdeform::rolling_pin:
+      case cpdeform::chopsticks: {
         const Real h = Real(0.5) * size[1];
         const P q = {p.x, p.y - clamp(p.y, -h, h), p.z};
         const Real r = length(q);
         return {q * (1 / r), r - size[0]};
       }
     }
+    cpdeform::throw_unknown_tool(kind);
   }
 
   CPDEFORM_INLINE static P across(const P& g, const P& normal) { return g - normal * dot(g, normal); }
@@ -151,7 +154,9 @@ struct Geometry {
         const Real turning = dot(g, around);
         return across(g - around * turning, q * (1 / s)) * (1 / s) + around * (turning * (r - size[0]) / (r * s));
       }
-      default: {
+      case cpdeform::capsule:
+      case cpdeform::rolling_pin:
+      case cpdeform::chopsticks: {
         const Real h = Real(0.5) * size[1];
         const P q = {p.x, p.y - clamp(p.y, -h, h), p.z};
         const Real r = length(q);
@@ -160,6 +165,7 @@ struct Geometry {
         return result;
       }
     }
+    cpdeform::throw_unknown_tool(kind);
   }
 
   // Half extents of a box around a tool in its local frame, and that box's centre.
@@ -186,10 +192,13 @@ struct Geometry {
         half[2] = size[0];
         centre[1] = Real(-0.5) * size[1];
         return;
-      default:
+      case cpdeform::capsule:
+      case cpdeform::rolling_pin:
         half[0] = half[2] = size[0];
         half[1] = Real(0.5) * size[1] + size[0];
+        return;
     }
+    cpdeform::throw_unknown_tool(kind);
   }
 };
 

@@ -39,15 +39,24 @@ class EngineOf final : public cpdeform::Engine<Real> {
 
   cpdeform::History* make_history(int64_t worlds, int64_t steps) override {
     HistoryOf* history = new HistoryOf(worlds);
+    try {
+      fill(*history, worlds, steps);
+    } catch (...) {
+      delete history;
+      throw;
+    }
+    return history;
+  }
+
+  void fill(HistoryOf& history, int64_t worlds, int64_t steps) {
     const cpdeform::Scene& scene = world_.scene();
     for (int64_t w = 0; w < worlds; ++w) {
-      WorldHistory<Real>& h = history->worlds[w];
+      WorldHistory<Real>& h = history.worlds[w];
       h.arena.attach(&pool_);
       h.steps = h.arena.template take<StepRecord<Real>>(steps);
       for (int64_t s = 0; s < steps; ++s) h.steps[s] = StepRecord<Real>{};
       h.poses = h.arena.template take<double>((steps * scene.substeps + 1) * scene.tool_count * cpdeform::pose_size);
     }
-    return history;
   }
 
   void rollout(cpdeform::Team& team, int thread, const cpdeform::RolloutArguments<Real>& a, cpdeform::History& history) override {
@@ -77,8 +86,8 @@ class EngineOf final : public cpdeform::Engine<Real> {
   void over_worlds(cpdeform::Team& team, int thread, int64_t worlds, F&& work) {
     const int size = team.size();
     const int64_t side_by_side = worlds / size * size;
-    for (int64_t w = thread; w < side_by_side; w += size) work(Crew{nullptr, 0, 1}, *works_[thread], w);
-    for (int64_t w = side_by_side; w < worlds; ++w) work(Crew{&team, thread, size}, *works_[size], w);
+    for (int64_t w = thread; w < side_by_side; w += size) work(Crew{nullptr, 0, 1, &team, thread}, *works_[thread], w);
+    for (int64_t w = side_by_side; w < worlds; ++w) work(Crew{&team, thread, size, &team, thread}, *works_[size], w);
   }
 
   // Memory for frames and sorting. One thread.

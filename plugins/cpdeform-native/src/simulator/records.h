@@ -13,8 +13,16 @@ namespace CPDEFORM_ISA {
 
 // The threads that work on one world: the whole team, or one thread alone.
 struct Crew {
-  cpdeform::Team* team;  // null: one thread
+  cpdeform::Team* team;   // null: one thread
   int thread, size;
+  cpdeform::Team* whole;  // the team that the crew belongs to
+  int thread_of_whole;    // this thread's number in it
+
+  // Take notice, once a substep, of the wish to end the call. All of the crew learn of it from `work.check()` after the next barrier.
+  template <class Work>
+  CPDEFORM_INLINE void take_notice(Work& work) const {
+    if (thread == 0 && whole->interrupted(thread_of_whole)) work.interrupt();
+  }
 
   template <class F>
   CPDEFORM_INLINE void barrier(F&& completion) const {
@@ -85,14 +93,23 @@ class Workspace {
       failed_.store(true, std::memory_order_relaxed);
     }
   }
-  void reset() { failed_.store(false, std::memory_order_relaxed); }
+  void interrupt() {
+    interrupted_.store(true, std::memory_order_relaxed);
+    failed_.store(true, std::memory_order_relaxed);
+  }
+  void reset() {
+    failed_.store(false, std::memory_order_relaxed);
+    interrupted_.store(false, std::memory_order_relaxed);
+  }
   bool failed() const { return failed_.load(std::memory_order_relaxed); }
   void check() const {
-    if (failed()) throw std::bad_alloc();
+    if (!failed()) return;
+    if (interrupted_.load(std::memory_order_relaxed)) cpdeform::throw_interrupted();
+    throw std::bad_alloc();
   }
 
  private:
-  std::atomic<bool> failed_{false};
+  std::atomic<bool> failed_{false}, interrupted_{false};
 };
 
 }  // namespace CPDEFORM_ISA

@@ -5,7 +5,7 @@
 
 namespace cpdeform {
 
-enum ToolKind : int { sphere, capsule, box, cylinder, torus, rolling_pin, chopsticks };
+enum ToolKind : int { sphere, capsule, box, cylinder, torus, rolling_pin, chopsticks, tool_kind_count };
 
 struct Tool {
   int kind;
@@ -17,6 +17,9 @@ struct Tool {
   double scale[7];  // motion per substep at action 1: length, radians
   double lower[3], upper[3];
 };
+
+// What a tool of no known kind is: an error, defined in checks.cpp.
+[[noreturn]] void throw_unknown_tool(int kind);
 
 constexpr int pose_size = 8;  // position, quaternion wxyz, gap
 constexpr int max_tools = 16;

@@ -222,6 +222,7 @@ class World {
   void forward_substep(const Crew& crew, Work& work, Arena* arena, Grid<Real>& momentum, const Frame<Real>& current,
                        const Frame<Real>& next, const double* poses, int64_t frame, const Range& range) const {
     const bool alone = crew.size == 1;
+    crew.take_notice(work);
     work.attempt([&] {
       if (alone) {
         momentum.box = T::bounds(current, range, constants_);
@@ -291,6 +292,7 @@ class World {
     const Real* velocity_after = last ? record.last_velocity : frame.data + (component_count + at_velocity) * stride_;
     const Grid<Real>& momentum = record.momentum[s];
     Grid<Real> grad_grid = {momentum.box, nullptr};
+    crew.take_notice(work);
     work.attempt([&] {
       if (alone) {
         grad_grid.nodes = reserve_nodes(work.grad_sum, momentum.box);

@@ -9,6 +9,9 @@
 #include <limits>
 #include <stdexcept>
 
+#include "arrays.h"
+#include "checks.h"
+#include "signals.h"
 #include "solver.h"
 
 namespace nb = nanobind;
@@ -24,7 +27,7 @@ using cpdeform::transport::Outcome;
 class Solver {
  public:
   Solver(int threads, const std::string& instruction_set)
-      : team_(threads), set_(cpdeform::instruction_set_of(instruction_set)) {}
+      : team_(checked(threads), cpdeform::signal_came), set_(cpdeform::instruction_set_of(instruction_set)) {}
 
   int threads() const { return team_.size(); }
   std::string instruction_set() const { return cpdeform::name_of(set_); }
@@ -35,6 +38,11 @@ class Solver {
   }
 
  private:
+  static int checked(int threads) {
+    cpdeform::expect_between("threads", threads, 1, cpdeform::most_threads);
+    return threads;
+  }
+
   cpdeform::Team team_;
   cpdeform::InstructionSet set_;
 };
@@ -47,14 +55,6 @@ using Points = nb::shape<-1, 3>;
 using Values = nb::shape<-1>;
 using Order = Out<int32_t, Values>;
 
-// Numbers that are read, of points, come from outside, maybe from a file.
-void check(const Order& order, size_t count, double extent) {
-  const auto outside = [count](int32_t number) { return number < 0 || static_cast<size_t>(number) >= count; };
-  if (order.shape(0) != count) throw std::invalid_argument("an order of another size than its cloud");
-  if (extent > 0.0 && std::any_of(order.data(), order.data() + count, outside))
-    throw std::invalid_argument("an order with numbers beyond its cloud");
-}
-
 template <class Real>
 nb::tuple solve(Solver& self, In<Real, Points> source, In<Real, Points> target, In<Real, Values> source_weights,
                 In<Real, Values> target_weights, Out<Real, Values> source_potential, Out<Real, Values> target_potential,
@@ -65,21 +65,27 @@ nb::tuple solve(Solver& self, In<Real, Points> source, In<Real, Points> target, 
   const size_t n = source.shape(0), m = target.shape(0);
   if (n == 0 || m == 0 || std::max(n, m) > static_cast<size_t>(std::numeric_limits<int>::max() / 64))
     throw std::invalid_argument("clouds need between 1 and 33 million points");
-  if (source_weights.shape(0) != n || source_potential.shape(0) != n || source_self.shape(0) != n || gradient.shape(0) != n ||
-      target_weights.shape(0) != m || target_potential.shape(0) != m || target_self.shape(0) != m)
-    throw std::invalid_argument("arrays of other sizes than their clouds");
-  check(source_order, n, source_extent);
-  check(target_order, m, target_extent);
+  const int64_t rows = static_cast<int64_t>(n), columns = static_cast<int64_t>(m);
+  cpdeform::expect_shape("source", source, {rows, 3});
+  cpdeform::expect_shape("target", target, {columns, 3});
+  cpdeform::expect_shape("source_weights", source_weights, {rows});
+  cpdeform::expect_shape("target_weights", target_weights, {columns});
+  cpdeform::expect_shape("source_potential", source_potential, {rows});
+  cpdeform::expect_shape("target_potential", target_potential, {columns});
+  cpdeform::expect_shape("source_self", source_self, {rows});
+  cpdeform::expect_shape("target_self", target_self, {columns});
+  cpdeform::expect_shape("gradient", gradient, {rows, 3});
+  cpdeform::expect_shape("source_order", source_order, {rows});
+  cpdeform::expect_shape("target_order", target_order, {columns});
   const Options options{exponent, blur, debias, scaling, tolerance, iterations, warm, warm_tolerance, warm_iterations, same_target};
   const Arrays<Real> arrays{source.data(),           target.data(),           source_weights.data(),   target_weights.data(),
                             static_cast<int>(n),     static_cast<int>(m),     source_potential.data(), target_potential.data(),
                             source_self.data(),      target_self.data(),      gradient.data(),
                             {source_order.data(), source_extent}, {target_order.data(), target_extent}};
+  cpdeform::transport::check_options(options);
+  cpdeform::transport::check_arrays(options, arrays);
   Outcome outcome;
-  {
-    nb::gil_scoped_release release;
-    outcome = self.solve<Real>(options, arrays);
-  }
+  cpdeform::unlocked([&] { outcome = self.solve<Real>(options, arrays); });
   return nb::make_tuple(outcome.iterations, outcome.marginal_error, outcome.source_extent, outcome.target_extent);
 }
 

@@ -4,6 +4,7 @@
 #include <atomic>
 #include <cmath>
 #include <limits>
+#include <stdexcept>
 
 namespace cpdeform::transport {
 
@@ -13,6 +14,8 @@ namespace {
 constexpr int slack = 3;
 // Sums so far from one that terms may have been clamped.
 constexpr int far_off = 100;
+// Guesses at a block: the second or third is good, and rounding alone can keep them from settling.
+constexpr int most_guesses = 100;
 // No list.
 constexpr int none = -1;
 // Passes that made lists, before all are forgotten: what each list was made for has to be compared with the present.
@@ -110,7 +113,10 @@ template <class Work>
 void SoftMinimum<Real>::for_blocks(Work&& work) {
   std::atomic<int> next{0};
   team_.run([&](int thread) {
-    for (int number = next.fetch_add(1); number < rows_.blocks(); number = next.fetch_add(1)) work(number, thread);
+    for (int number = next.fetch_add(1); number < rows_.blocks(); number = next.fetch_add(1)) {
+      if (team_.interrupted(thread)) throw_interrupted();
+      work(number, thread);
+    }
   });
 }
 
@@ -196,7 +202,7 @@ int SoftMinimum<Real>::solve_block(Rows<Real>& rows, Real* guess, int number, st
                                    int present) {
   std::vector<int32_t>& list = lists_[number];
   int evaluated = 0;
-  for (;;) {
+  for (int guesses = 0; guesses < most_guesses; ++guesses) {
     const int32_t* columns = list.data();
     int count = static_cast<int>(list.size());
     Real reach = reach_[number];
@@ -223,6 +229,7 @@ int SoftMinimum<Real>::solve_block(Rows<Real>& rows, Real* guess, int number, st
     for (int i = 0; i < block_size; ++i) guess[i] -= rows.log2_sum[i];
     rows.t_largest = *std::max_element(guess, guess + block_size);
   }
+  throw std::runtime_error("The potentials do not settle: costs are too large, against the blur, for the precision.");
 }
 
 template class SoftMinimum<float>;

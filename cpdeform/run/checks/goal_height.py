@@ -1,0 +1,93 @@
+"""A goal that hangs in the air, or lies lower than clay can."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cpdeform.core.scene import WALL_NODES, ManipulatorChopsticks, Scene
+from cpdeform.core.signed_distance import signed_distance
+from cpdeform.core.state import manipulator_pose
+from cpdeform.run.checks.finding import Finding
+from cpdeform.run.checks.occupancy import solids
+
+FLOATING_CELLS = 2.0
+"""Grid cells between a goal's part and what carries it, from which on it counts as floating."""
+LEAST_PART = 0.02
+"""Part of the goal's particles that is worth telling of."""
+
+
+def floor_height(scene: Scene) -> float:
+    """Height that clay comes to rest at, length units: the top of the floor's boundary layer, whose nodes let nothing sink."""
+    return (WALL_NODES + int(scene.ground_height / scene.node_distance)) * scene.node_distance
+
+
+def check_goal_floating(scene: Scene, goal: NDArray[np.float64]) -> list[Finding]:
+    """Tell of parts of the goal (M, 3), length units, that nothing carries: neither the floor nor a fixed tool.
+
+    Tools that can grip may hold clay up to the end of a stage; then it is but a note.
+    """
+    if scene.gravity[1] >= 0.0:
+        return []
+    heights, share = [], 0.0
+    labels = solids(goal, FLOATING_CELLS * scene.node_distance)
+    free = FLOATING_CELLS * scene.node_distance
+    for part in range(int(labels.max()) + 1):
+        particles = goal[labels == part]
+        height = float(particles[:, 1].min()) - floor_height(scene)
+        if len(particles) >= LEAST_PART * len(goal) and height > free and not _near_fixed_tool(scene, particles, free):
+            heights.append(height)
+            share += len(particles) / len(goal)
+    if not heights:
+        return []
+    held = _can_grip(scene)
+    span = f"{min(heights):.3g}" if len(heights) == 1 else f"{min(heights):.3g} to {max(heights):.3g}"
+    return [
+        Finding(
+            "note" if held else "warning",
+            "goal floating",
+            "target",
+            f"{share:.0%} of the goal hangs {span} above where clay rests, {floor_height(scene):.3g}, and "
+            + ("only tools can hold it there." if held else "no tools can hold it there."),
+            "Lower the goal by that much, or raise the floor (ground_height)"
+            + ("; keep it if the tools are to lift the clay." if held else "."),
+        )
+    ]
+
+
+def check_goal_below_floor(scene: Scene, clay: NDArray[np.float64], goal: NDArray[np.float64]) -> list[Finding]:
+    """Tell of a goal (M, 3) with particles lower than the floor lets clay (N, 3) sink, length units.
+
+    The floor's boundary layer is a few nodes thick. Clay that starts inside it stays as low as it is; other clay rests on top.
+    """
+    lowest = min(floor_height(scene), float(clay[:, 1].min())) - 0.25 * scene.node_distance
+    share = float((goal[:, 1] < lowest).mean())
+    if share < LEAST_PART:
+        return []
+    return [
+        Finding(
+            "warning",
+            "goal below the floor",
+            "target",
+            f"{share:.0%} of the goal's particles lie lower than clay can get: it comes to rest at a height of "
+            f"{floor_height(scene):.3g}, {WALL_NODES} grid nodes above ground_height, and none starts lower than "
+            f"{float(clay[:, 1].min()):.3g}.",
+            f"Raise the goal by {max(0.0, lowest + 0.25 * scene.node_distance - float(goal[:, 1].min())):.3g}, "
+            "or start the bodies as low.",
+        )
+    ]
+
+
+def _near_fixed_tool(scene: Scene, particles: NDArray[np.float64], distance: float) -> bool:
+    poses = manipulator_pose(scene)
+    return any(
+        float(signed_distance(tool, poses[index], torch.as_tensor(particles)).min()) <= distance
+        for index, tool in enumerate(scene.manipulators)
+        if not tool.movable
+    )
+
+
+def _can_grip(scene: Scene) -> bool:
+    movable = [tool for tool in scene.manipulators if tool.movable]
+    return len(movable) > 1 or any(isinstance(tool, ManipulatorChopsticks) for tool in movable)
