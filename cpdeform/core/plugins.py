@@ -7,7 +7,6 @@ import dataclasses
 import importlib
 import importlib.metadata
 import inspect
-import re
 import traceback
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import pluggy
 
 from cpdeform.core import hookspecs
-from cpdeform.core.errors import CpdeformError, InputError, MissingExtraError, PluginError, UnknownNameError
+from cpdeform.core.errors import CpdeformError, InputError, MissingExtraError, PluginError, UnknownNameError, brief
 from cpdeform.core.hookspecs import PluginSpec
 
 GROUP = "cpdeform"
@@ -26,6 +25,8 @@ KINDS: Mapping[str, str] = {
     "task": "cpdeform_tasks",
 }
 """What can be registered, and the hook that registers it."""
+
+_KEY_PARTS = 20
 
 AUTO = "auto"
 """The name that stands for the fastest simulator or transport solver that is installed; see `PluginSpec.automatic`."""
@@ -268,35 +269,23 @@ def load_registry(entry_points: Iterable[importlib.metadata.EntryPoint] | None =
     return Registry(manager, registrations, failures)
 
 
-def _read_value(text: str) -> Any:
-    """Read YAML, with ``1e-3`` a number as in YAML 1.2 (PyYAML, which is YAML 1.1, takes it for text)."""
-    # Imported on use: PyYAML is a tenth of the start-up time of commands that read no option.
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        """A loader of its own, so that the resolver below does not change `yaml.safe_load` for others."""
-
-    number = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
-    Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+.0123456789"))
-    try:
-        return yaml.load(text, Loader=Loader)
-    except yaml.YAMLError as error:
-        reason = " ".join(str(error).split())
-        raise InputError("--set", came=f'"{text}"', expected="a YAML value after =", remedy=f"YAML says: {reason}") from error
-
-
 def split_options(values: Iterable[str]) -> dict[str, Any]:
     """Read ``key=value`` assignments, values as YAML, dots nesting: ``a.b=1`` gives ``{"a": {"b": 1}}``.
 
     Raises:
-        InputError: An assignment has no ``=``, its value is not YAML, or a key is set both as a value and as a group.
+        InputError: An assignment has no ``=``, its value is not YAML, its key has too many parts, or a key is set both as a value
+            and as a group.
     """
+    from cpdeform.core.reading.yaml_text import parse_yaml
+
     result: dict[str, Any] = {}
     for value in values:
         key, equals, text = value.partition("=")
         if not equals or not all(part.strip() for part in key.split(".")):
             remedy = "For example --set optimizer.learning_rate=0.05"
             raise InputError("--set", came=f'"{value}"', expected="key=value", remedy=remedy)
+        if key.count(".") >= _KEY_PARTS:
+            raise InputError("--set", came=f'"{key}"', expected=f"a key of at most {_KEY_PARTS} parts")
         node = result
         *parents, last = key.strip().split(".")
         for parent in parents:
@@ -305,5 +294,5 @@ def split_options(values: Iterable[str]) -> dict[str, Any]:
                 raise InputError("--set", came=f'"{key}"', expected=f'"{parent}" to be set once, as a value or as a group')
         if isinstance(node.get(last), dict):
             raise InputError("--set", came=f'"{key}"', expected=f'"{last}" to be set once, as a value or as a group')
-        node[last] = _read_value(text)
+        node[last] = parse_yaml(text, argument=f"--set {brief(key, 60)}")
     return result

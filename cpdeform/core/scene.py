@@ -22,6 +22,9 @@ Quaternion = tuple[float, float, float, float]
 PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegativeFloat = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
+MOST_PARTICLES = 10_000_000
+"""Particles of a scene at most: what the memory check lets through takes days, and more is a slip of the keyboard."""
+
 WALL_NODES = 3
 """Width of the boundary layer at each face of the domain, in grid nodes."""
 
