@@ -25,6 +25,12 @@ NonNegativeFloat = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 MOST_PARTICLES = 10_000_000
 """Particles of a scene at most: what the memory check lets through takes days, and more is a slip of the keyboard."""
 
+MOST_STEPS = 100_000
+"""Environment steps of a stage at most."""
+
+MOST_SEED = 2**63 - 1
+"""Largest seed: what fits into a signed number of 64 bits, as every generator of random numbers takes it."""
+
 WALL_NODES = 3
 """Width of the boundary layer at each face of the domain, in grid nodes."""
 

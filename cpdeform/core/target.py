@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.reading.arrays import open_arrays
+from cpdeform.core.reading.arrays import check_bytes, open_arrays
 from cpdeform.core.reading.limits import ReadingLimits
 from cpdeform.core.scene import Scene
 
@@ -99,11 +99,12 @@ def dense_grid(cells: NDArray[Any], masses: NDArray[Any], size: int, *, argument
         remedy: What the user can do where they do not fit.
 
     Raises:
-        InputError: An index lies outside of the grid or comes twice.
+        InputError: An index lies outside of the grid or comes twice, or the grid is too large.
     """
     if len(cells) and not (int(cells.min()) >= 0 and int(cells.max()) < size):
         came = f"a node index {int(cells.min()) if int(cells.min()) < 0 else int(cells.max())}"
         raise InputError(argument, came=came, expected=f"indices from 0 to {size - 1} (grid_size {size})", remedy=remedy)
+    check_bytes(8 * size**3, argument=argument, came=f"a grid of {size} nodes along an axis")
     flat = np.ravel_multi_index(tuple(cells.astype(np.int64).T), (size,) * 3)
     if len(np.unique(flat)) != len(flat):
         came = f"{len(flat) - len(np.unique(flat))} nodes more than once"

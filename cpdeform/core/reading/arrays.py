@@ -11,7 +11,7 @@ import abc
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -83,14 +83,17 @@ class ArrayFile:
         container: The file's format.
         argument: What the file is, for messages.
         limits: What is accepted.
+        sizes: Sizes that are known already, by the names that `read` uses.
     """
 
-    def __init__(self, container: Container, *, argument: str, limits: ReadingLimits) -> None:
+    def __init__(
+        self, container: Container, *, argument: str, limits: ReadingLimits, sizes: Mapping[str, int] | None = None
+    ) -> None:
         self.container = container
         self.argument = argument
         self._limits = limits
         self._taken = 0
-        self._sizes: dict[str, int] = {}
+        self._sizes = dict(sizes or {})
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -154,18 +157,33 @@ class ArrayFile:
 
     def _charge(self, argument: str, header: Header) -> None:
         self._taken += header.bytes
-        most = self._limits.array_bytes
-        if self._taken > most:
-            raise InputError(
-                argument,
-                came=f"{header}, {self._taken / MEBIBYTE:.4g} MiB with what was read before",
-                expected=f"at most {most / MEBIBYTE:.4g} MiB",
-                remedy=f"If you trust the file, set {VARIABLE} higher.",
-            )
+        came = f"{header}, with what was read before"
+        check_bytes(self._taken, argument=argument, came=came, limits=self._limits)
+
+
+def check_bytes(count: int, *, argument: str, came: str, limits: ReadingLimits | None = None) -> None:
+    """Raise `InputError` where an array that a file asks for takes more memory than is accepted.
+
+    Args:
+        count: Its bytes.
+        argument: What asks for it, for messages.
+        came: What it is.
+        limits: What is accepted; defaults to `default_limits`.
+    """
+    most = (limits or default_limits()).array_bytes
+    if count > most:
+        raise InputError(
+            argument,
+            came=f"{came}: {count / MEBIBYTE:.4g} MiB",
+            expected=f"at most {most / MEBIBYTE:.4g} MiB",
+            remedy=f"If you trust the file, set {VARIABLE} higher.",
+        )
 
 
 @contextlib.contextmanager
-def open_arrays(path: Path, *, argument: str, expected: str, limits: ReadingLimits | None = None) -> Iterator[ArrayFile]:
+def open_arrays(
+    path: Path, *, argument: str, expected: str, limits: ReadingLimits | None = None, sizes: Mapping[str, int] | None = None
+) -> Iterator[ArrayFile]:
     """Open an ``.npz``, ``.npy`` or HDF5 file; whatever goes wrong inside becomes an `InputError`.
 
     Args:
@@ -173,6 +191,7 @@ def open_arrays(path: Path, *, argument: str, expected: str, limits: ReadingLimi
         argument: What the file is, for messages.
         expected: What would have been accepted, for messages.
         limits: What is accepted; defaults to `default_limits`.
+        sizes: As for `ArrayFile`.
 
     Raises:
         InputError: The file is missing, unreadable, or of another format.
@@ -195,7 +214,7 @@ def open_arrays(path: Path, *, argument: str, expected: str, limits: ReadingLimi
         else:
             begins = f"unreadable content (it begins with {start!r})" if start else "unreadable content (an empty file)"
             raise InputError(argument, came=begins, expected=expected)
-        yield ArrayFile(container, argument=argument, limits=limits)
+        yield ArrayFile(container, argument=argument, limits=limits, sizes=sizes)
 
 
 def _size(file: BinaryIO) -> int:

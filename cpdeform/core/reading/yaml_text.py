@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import re
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.reading.boundary import boundary, read_text
@@ -78,11 +78,6 @@ def _loader_class() -> Any:
     class Loader(yaml.SafeLoader):
         """Counts values while it composes them, before any mapping or list is built."""
 
-        yaml_implicit_resolvers: ClassVar = {
-            sign: [(tag, pattern) for tag, pattern in pairs if tag.rpartition(":")[2] in ("null", "bool", "merge")]
-            for sign, pairs in yaml.SafeLoader.yaml_implicit_resolvers.items()
-        }
-
         def __init__(self, text: str, argument: str, limits: ReadingLimits) -> None:
             super().__init__(text)
             self._argument, self._limits = argument, limits
@@ -148,6 +143,10 @@ def _loader_class() -> Any:
                 self._refuse(f'"{node.value}" for a number')
             return float(re.sub(r"\.(?=[in])", "", node.value.lower().replace("_", "")))
 
+    Loader.yaml_implicit_resolvers = {
+        sign: [(tag, pattern) for tag, pattern in pairs if tag.rpartition(":")[2] in ("null", "bool", "merge")]
+        for sign, pairs in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
     Loader.add_constructor("tag:yaml.org,2002:int", Loader.construct_yaml_int)
     Loader.add_constructor("tag:yaml.org,2002:float", Loader.construct_yaml_float)
     Loader.add_implicit_resolver("tag:yaml.org,2002:int", re.compile(f"^(?:{_INT.pattern})$"), list("-+0123456789"))
