@@ -10,6 +10,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
+from cpdeform.core.bounded import MOST_SEED
 from cpdeform.core.errors import InputError
 from cpdeform.core.reading.arrays import open_arrays
 from cpdeform.core.reading.boundary import boundary
@@ -19,7 +20,6 @@ from cpdeform.core.reading.models import validate
 from cpdeform.core.record_files import METRICS_FILE, RUN_FILE, TARGET_FILE, stage_files
 from cpdeform.core.record_stage import read_stage
 from cpdeform.core.result import StageResult, Status
-from cpdeform.core.scene import MOST_SEED
 from cpdeform.core.state import State
 from cpdeform.core.task import Task
 

@@ -15,21 +15,23 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from cpdeform.core.bounded import (
+    MOST_PARTICLES,
+    MOST_PARTS,
+    MOST_STEPS,
+    Coordinate,
+    Length,
+    Lengths3,
+    NonNegativeFloat,
+    PositiveFloat,
+    Real,
+    Seed,
+    Whole,
+)
 from cpdeform.core.errors import InputError
 
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NonNegativeFloat = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-
-MOST_PARTICLES = 10_000_000
-"""Particles of a scene at most: what the memory check lets through takes days, and more is a slip of the keyboard."""
-
-MOST_STEPS = 100_000
-"""Environment steps of a stage at most."""
-
-MOST_SEED = 2**63 - 1
-"""Largest seed: what fits into a signed number of 64 bits, as every generator of random numbers takes it."""
+Vector3 = tuple[Coordinate, Coordinate, Coordinate]
+Quaternion = tuple[Real, Real, Real, Real]
 
 WALL_NODES = 3
 """Width of the boundary layer at each face of the domain, in grid nodes."""
@@ -51,7 +53,7 @@ class Material(FrozenModel):
     """
 
     youngs_modulus: PositiveFloat = 5000.0
-    poisson_ratio: float = Field(default=0.2, gt=-1.0, lt=0.5)
+    poisson_ratio: Real = Field(default=0.2, gt=-1.0, lt=0.5)
     yield_stress: PositiveFloat = 50.0
 
     @property
@@ -77,8 +79,8 @@ class BodyBox(FrozenModel):
 
     kind: Literal["box"] = "box"
     position: Vector3
-    widths: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
-    particle_count: int = Field(default=10000, gt=0)
+    widths: Lengths3
+    particle_count: Whole = Field(default=10000, gt=0, le=MOST_PARTICLES)
     material: Material | None = None
 
     @property
@@ -99,8 +101,8 @@ class BodySphere(FrozenModel):
 
     kind: Literal["sphere"] = "sphere"
     position: Vector3
-    radius: PositiveFloat
-    particle_count: int = Field(default=10000, gt=0)
+    radius: Length
+    particle_count: Whole = Field(default=10000, gt=0, le=MOST_PARTICLES)
     material: Material | None = None
 
     @property
@@ -128,7 +130,7 @@ class ManipulatorBase(FrozenModel):
     position: Vector3
     rotation_wxyz: Quaternion = (1.0, 0.0, 0.0, 0.0)
     friction: NonNegativeFloat = 0.9
-    action_scale: tuple[NonNegativeFloat, ...] = ()
+    action_scale: tuple[Annotated[Real, Field(ge=0.0, le=1000.0)], ...] = ()
     lower_bound: Vector3 = (0.0, 0.0, 0.0)
     upper_bound: Vector3 = (1.0, 1.0, 1.0)
 
@@ -162,14 +164,14 @@ class ManipulatorSphere(ManipulatorBase):
     """A ball. Attributes: radius, length units."""
 
     kind: Literal["Sphere"] = "Sphere"
-    radius: PositiveFloat
+    radius: Length
 
 
 class ManipulatorRod(ManipulatorBase):
     """All points within `radius` of the segment y in [-height/2, height/2] of the local frame, length units."""
 
-    radius: PositiveFloat
-    height: PositiveFloat
+    radius: Length
+    height: Length
 
 
 class ManipulatorCapsule(ManipulatorRod):
@@ -199,9 +201,9 @@ class ManipulatorChopsticks(ManipulatorBase):
     """
 
     kind: Literal["Chopsticks"] = "Chopsticks"
-    radius: PositiveFloat
-    height: PositiveFloat
-    gap: PositiveFloat = 0.06
+    radius: Length
+    height: Length
+    gap: Length = 0.06
     action_meanings: ClassVar[Mapping[int, str]] = MappingProxyType(
         {0: "fixed", 7: "translation, rotation in the tool's own frame, closing of the gap"}
     )
@@ -211,24 +213,24 @@ class ManipulatorBox(ManipulatorBase):
     """A block of `half_extents` (3,), grown by `rounding` on all sides, length units."""
 
     kind: Literal["Box"] = "Box"
-    half_extents: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
-    rounding: NonNegativeFloat = 0.0
+    half_extents: Lengths3
+    rounding: Coordinate = Field(default=0.0, ge=0.0)
 
 
 class ManipulatorCylinder(ManipulatorBase):
     """A solid cylinder about the local y axis: `radius` and `half_height`, length units."""
 
     kind: Literal["Cylinder"] = "Cylinder"
-    radius: PositiveFloat
-    half_height: PositiveFloat
+    radius: Length
+    half_height: Length
 
 
 class ManipulatorTorus(ManipulatorBase):
     """A ring about the local y axis: `major_radius` to the tube's centre and `tube_radius`, length units."""
 
     kind: Literal["Torus"] = "Torus"
-    major_radius: PositiveFloat
-    tube_radius: PositiveFloat
+    major_radius: Length
+    tube_radius: Length
 
 
 Manipulator = Annotated[
@@ -264,19 +266,26 @@ class Scene(FrozenModel):
         sampling_seed: Seed of the particle positions inside the bodies.
     """
 
-    bodies: tuple[Body, ...] = Field(min_length=1)
-    manipulators: tuple[Manipulator, ...] = ()
+    bodies: tuple[Body, ...] = Field(min_length=1, max_length=MOST_PARTS)
+    manipulators: tuple[Manipulator, ...] = Field(default=(), max_length=MOST_PARTS)
     material: Material = Material()
     gravity_parameter: Vector3 = (0.0, -1.0, 0.0)
-    gravity_scale: NonNegativeFloat = 30.0
+    gravity_scale: Real = Field(default=30.0, ge=0.0, le=1e6)
     ground_friction: NonNegativeFloat = 1.5
-    ground_height: NonNegativeFloat = 0.0
-    grid_size: int = Field(default=64, ge=8, le=512)
-    time_step: PositiveFloat = 1e-4
-    substeps: int = Field(default=19, ge=1)
-    softness: NonNegativeFloat = 666.0
+    ground_height: Real = Field(default=0.0, ge=0.0, le=1.0)
+    grid_size: Whole = Field(default=64, ge=8, le=512)
+    time_step: Real = Field(default=1e-4, ge=1e-12, le=1.0)
+    substeps: Whole = Field(default=19, ge=1, le=MOST_STEPS)
+    softness: Real = Field(default=666.0, ge=0.0, le=1e9)
     sampling: Literal["uniform", "plasticinelab"] = "uniform"
-    sampling_seed: int = Field(default=0, ge=0, le=2**32 - 1)
+    sampling_seed: Seed = Field(default=0, le=2**32 - 1)
+
+    @model_validator(mode="after")
+    def _check_particle_count(self) -> Scene:
+        if self.particle_count > MOST_PARTICLES:
+            came = f"{self.particle_count} particles of all bodies"
+            raise InputError("bodies", came=came, expected=f"at most {MOST_PARTICLES}")
+        return self
 
     @model_validator(mode="after")
     def _check_bodies_inside(self) -> Scene:

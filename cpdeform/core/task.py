@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from cpdeform.core.bounded import MOST_STAGES, MOST_STEPS, Name, Whole
 from cpdeform.core.errors import InputError, PluginError, UnknownNameError
-from cpdeform.core.plugins import Registry, load_registry
+from cpdeform.core.plugins import Registry, describe, load_registry, redirect_prints
 from cpdeform.core.reading.models import validate
 from cpdeform.core.reading.yaml_text import read_yaml
 from cpdeform.core.scene import FrozenModel, Scene
@@ -48,13 +49,13 @@ class Task(FrozenModel):
             Its `scene` holds limits that plans keep to, such as slower tools; `scene` above stays the benchmark's.
     """
 
-    name: str
-    summary: str = ""
+    name: Name
+    summary: str = Field(default="", max_length=10_000)
     scene: Scene
     target: Path
-    step_count: int = Field(default=10, ge=1)
-    rest_steps: int = Field(default=0, ge=0)
-    stage_count: int = Field(default=1, ge=1)
+    step_count: Whole = Field(default=10, ge=1, le=MOST_STEPS)
+    rest_steps: Whole = Field(default=0, ge=0, le=MOST_STEPS)
+    stage_count: Whole = Field(default=1, ge=1, le=MOST_STAGES)
     metric: Literal["incremental_iou", "wasserstein"] = "wasserstein"
     settings: dict[str, Any] = Field(default_factory=dict)
 
@@ -211,9 +212,12 @@ def task_path(name: str, *, registry: Registry) -> Path:
     """
     package, _, file = registry.find("task", name).spec.target.partition(":")
     try:
-        return Path(str(importlib.resources.files(package) / file))
-    except Exception as error:
-        raise PluginError(f'task "{name}": cannot import {package}: {type(error).__name__}: {error}') from error
+        with redirect_prints():
+            return Path(str(importlib.resources.files(package) / file))
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise PluginError(f'task "{name}": cannot import {package}: {describe(error)}') from error
 
 
 def load_task(name: str | Path, *, registry: Registry | None = None) -> Task:

@@ -20,12 +20,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cpdeform.core.bounded import MOST_PARTICLES
 from cpdeform.core.errors import InputError, UnknownNameError
 from cpdeform.core.objectives.mass import mass_grid
 from cpdeform.core.plugins import Registry, load_registry
 from cpdeform.core.reading.arrays import MOST_NUMBER, NUMBERS, ArrayFile, open_arrays
 from cpdeform.core.reading.limits import ReadingLimits
-from cpdeform.core.scene import MOST_PARTICLES, Scene
+from cpdeform.core.scene import Scene
 from cpdeform.core.target import POSITION_SCALE, dense_grid, write_target
 from cpdeform.core.task import Task, load_task
 

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from torch import Tensor
 
+from cpdeform.core.bounded import MOST_STEPS
 from cpdeform.core.errors import CapabilityError, InputError, brief
 from cpdeform.core.reading.arrays import NUMBERS, ArrayFile, open_arrays
 from cpdeform.core.reading.json_text import read_json
 from cpdeform.core.reading.limits import ReadingLimits
 from cpdeform.core.reading.models import field_error
-from cpdeform.core.scene import MOST_STEPS, Scene
+from cpdeform.core.scene import Scene
 from cpdeform.core.state import State, elastic_strain_from_gradient
 from cpdeform.core.target import dense_grid
 
