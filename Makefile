@@ -9,7 +9,7 @@ NATIVE_SOURCES := $(shell find plugins/cpdeform-native -name '*.cpp' -o -name '*
 COMPILER := $(shell command -v $${CXX:-c++} 2>/dev/null)
 OUT ?= runs/first
 
-.PHONY: run test quick lint targets clean
+.PHONY: run test quick faults lint targets clean
 
 run: $(NATIVE)
 	$(BIN)/cpdeform run writer --out $(OUT) --overwrite
@@ -23,6 +23,10 @@ endif
 
 quick: $(NATIVE)
 	$(BIN)/python -m pytest -m "not slow"
+
+# 12,000 damaged files and options, some minutes; `make test` tries a part of them.
+faults: $(NATIVE)
+	$(BIN)/python -m pytest -m faults
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import CapabilityError, InputError
+from cpdeform.core.memory_limit import check_memory
 from cpdeform.core.metrics import evaluate_metric
 from cpdeform.core.objective import Objective
 from cpdeform.core.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
@@ -88,8 +89,8 @@ class Planner:
 
         Raises:
             CapabilityError: The parts do not fit together.
-            InputError: `stages` or `first_stage` is out of range, the goal or `state` cannot be used, or a tool starts inside the
-                body.
+            InputError: `stages` or `first_stage` is out of range, the goal or `state` cannot be used, a tool starts inside the
+                body, or there is not enough memory.
         """
         count = self.task.stage_count if stages is None else stages
         if count < 1:
@@ -97,6 +98,7 @@ class Planner:
         if first_stage < 0:
             raise InputError("first_stage", came=str(first_stage), expected="0 or more")
         self._check()
+        check_memory(self.simulator, step_count=self.task.rollout_steps, worlds=1)
         scene_start = self.simulator.initial_state(batch_size=1)
         check_tools_outside(self.task.scene, scene_start)
         state = scene_start if state is None else self._check_state(state)
@@ -246,6 +248,7 @@ class Planner:
         found = []
         for start in range(0, len(placements), self.simulator.batch_size):
             part = placements[start : start + self.simulator.batch_size]
+            check_memory(self.simulator, step_count=self.task.rollout_steps, worlds=len(part))
             worlds = state.fork(len(part)).with_manipulators(torch.stack([placement.pose for placement in part]))
             actions = first_actions[start : start + len(part)]
             estimate = self.simulator.memory_estimate(self.task.rollout_steps, worlds=len(part))

@@ -7,6 +7,7 @@ A file holds x0, v0, F0, C0 (start), prim (tool states), actions, x, v (end), an
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -103,7 +104,7 @@ def read_golden(
         CapabilityError: The scene holds a manipulator that this version does not know.
     """
     scene_name, grid_name = _names(path)
-    beside = path.resolve().parent.parent / "plasticinelab"
+    beside = Path(os.path.realpath(path)).parent.parent / "plasticinelab"
     definition = _definition(scenes or beside / "scenes.json", scene_name)
     with open_arrays(path, argument=str(path), expected="a golden file", limits=limits) as file:
         scene = _scene(f"{scenes or beside / 'scenes.json'}: {scene_name}", definition, file)
