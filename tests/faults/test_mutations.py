@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,8 +17,11 @@ MEGABYTES = 500
 
 def try_damaged(kinds: tuple[str, ...], count: int, directory: Path, *, limit: float) -> None:
     command = [sys.executable, str(CAMPAIGN), ",".join(kinds), str(count), "0", str(directory)]
+    path = os.pathsep.join([str(CAMPAIGN.parents[1]), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
     try:
-        finished = subprocess.run(command, capture_output=True, text=True, timeout=limit)
+        finished = subprocess.run(
+            command, capture_output=True, text=True, timeout=limit, env={**os.environ, "PYTHONPATH": path.strip(os.pathsep)}
+        )
     except subprocess.TimeoutExpired as error:
         pytest.fail(f"not done after {limit:g} seconds; the last case was {(error.stderr or b'').decode().splitlines()[-1:]}")
     assert finished.returncode == 0, finished.stderr[-2000:]
