@@ -1,6 +1,7 @@
 """Reads damaged inputs, in a process of its own: ``campaign.py KINDS COUNT SEED DIRECTORY``, with kinds such as ``goal,grid``.
 
-The folder `tests` has to be on PYTHONPATH. The last line of the output is a JSON object with what was found of each kind. A case that takes too long is interrupted.
+The folder `tests` has to be on PYTHONPATH. The last line of the output is a JSON object with what was found of each kind. A case
+that takes too long is interrupted.
 """
 
 from __future__ import annotations

@@ -18,9 +18,9 @@ import numpy as np
 HUGE_TEXT = "x" * 100_000
 VALUES: tuple[Any, ...] = (
     None, True, False, "", "5", "1e3", HUGE_TEXT, "²", "../../x", "a\x00b", "name: [", -1, 0, 1, 2, 1.5, -0.5, 1e3, 1e-320, 1e308,
-    -1e308, 10**19, 2**64, -(2**63) - 1, 10**30, 2_000_000_000, 100_000_000, float("nan"), float("inf"), float("-inf"), [], {}, [1], [[]],
-    ["a", "b"], {"a": 1}, {"0": 1}, [1, 2, 3], [1, 2, 3, 4], [0.5] * 3, [True] * 3, ["5"] * 3, [float("nan")] * 3, [1e308] * 3,
-    [None] * 3, list(range(1000)), {str(index): index for index in range(300)},
+    -1e308, 10**19, 2**64, -(2**63) - 1, 10**30, 2_000_000_000, 100_000_000, float("nan"), float("inf"), float("-inf"), [], {},
+    [1], [[]], ["a", "b"], {"a": 1}, {"0": 1}, [1, 2, 3], [1, 2, 3, 4], [0.5] * 3, [True] * 3, ["5"] * 3, [float("nan")] * 3,
+    [1e308] * 3, [None] * 3, list(range(1000)), {str(index): index for index in range(300)},
 )  # fmt: skip
 
 
