@@ -17,11 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cpdeform.core.bounded import MOST_COUNT, MOST_SEED, MOST_STAGES
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.memory_limit import check_memory
 from cpdeform.core.metrics import evaluate_metric
 from cpdeform.core.objective import Objective
 from cpdeform.core.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
+from cpdeform.core.options import whole_number
 from cpdeform.core.ot import OTSolver
 from cpdeform.core.placer import LEAST_GAIN, Placement, PlacementResult, Placer, Stage
 from cpdeform.core.priorities import PriorityKind, transport_displacements, transport_priorities
@@ -93,10 +95,9 @@ class Planner:
                 body, or there is not enough memory.
         """
         count = self.task.stage_count if stages is None else stages
-        if count < 1:
-            raise InputError("stages", came=str(count), expected="at least 1")
-        if first_stage < 0:
-            raise InputError("first_stage", came=str(first_stage), expected="0 or more")
+        count = whole_number("stages", count, least=1, most=MOST_STAGES)
+        first_stage = whole_number("first_stage", first_stage, least=0, most=MOST_COUNT)
+        whole_number("seed", self.seed, least=0, most=MOST_SEED)
         self._check()
         check_memory(self.simulator, step_count=self.task.rollout_steps, worlds=1)
         scene_start = self.simulator.initial_state(batch_size=1)

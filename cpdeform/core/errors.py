@@ -74,21 +74,22 @@ def _joined(parts: dict[str, str]) -> str:
 
 
 def nearest_name(name: str, names: Iterable[str]) -> str | None:
-    """The name that was probably meant: the most alike, or the one whose words begin with the letters given (``lr``).
+    """The name that was probably meant: one that has this word (``rate``) or these initials (``lr``), or the most alike.
 
     Args:
         name: What was typed.
         names: The names that exist.
     """
     known, typed = sorted(names), name[:100].lower()
-    near = difflib.get_close_matches(typed, known, n=1, cutoff=0.5)
-    if near or not typed:
-        return near[0] if near else None
-    for candidate in known:
-        words = candidate.lower().split("_")
-        if typed == "".join(word[:1] for word in words) or (len(typed) > 2 and any(word.startswith(typed) for word in words)):
-            return candidate
-    return None
+    if not typed:
+        return None
+    words = {candidate: candidate.lower().split("_") for candidate in known}
+    initials = {candidate: "".join(word[:1] for word in found) for candidate, found in words.items()}
+    spoken = [item for item in known if len(words[item]) > 1 and (typed == initials[item] or typed in words[item])]
+    near = spoken[:1] or difflib.get_close_matches(typed, known, n=1, cutoff=0.5)
+    if not near and len(typed) > 2:
+        near = [item for item in known if any(word.startswith(typed) for word in words[item])]
+    return near[0] if near else None
 
 
 class UnknownNameError(InputError):

@@ -25,6 +25,8 @@ from cpdeform.core.reading.limits import MEBIBYTE, VARIABLE, ReadingLimits, defa
 NUMBERS = "fui"
 """Kinds of `numpy.dtype` that are real numbers; ``"b"`` is for truth values."""
 
+_REMEDY = "Other formats: read them with their own library and save the numbers with numpy.savez."
+
 _NAMES = {"f": "numbers", "u": "whole numbers", "i": "whole numbers", "b": "truth values"}
 MOST_NUMBER = 1e30
 """Largest magnitude that is accepted where numbers have to be finite: its square is finite, too."""
@@ -213,7 +215,7 @@ def open_arrays(
             container = stack.enter_context(arrays_hdf5.open_hdf5(path, size=_size(file), limits=limits))
         else:
             begins = f"unreadable content (it begins with {start!r})" if start else "unreadable content (an empty file)"
-            raise InputError(argument, came=begins, expected=expected)
+            raise InputError(argument, came=begins, expected=expected, remedy=_REMEDY if start else "")
         yield ArrayFile(container, argument=argument, limits=limits, sizes=sizes)
 
 
