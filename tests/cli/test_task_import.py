@@ -130,7 +130,7 @@ def test_negative_masses_that_are_rounding_count_as_none(directory, grid):
     noisy = grid.copy()
     noisy[tuple(empty.T)] = -2.6e-5
     np.save("noisy.npy", noisy)
-    result = invoke("noisy.npy", "--task", "shift.yaml", "--out", "noisy.npz")
+    result = invoke("noisy.npy", "--task", "shift.yaml", "--particles", 50, "--out", "noisy.npz")
     assert result.exit_code == 0, result.output
     assert "20 negative masses" in result.stderr
     kept = load_target_grid(directory / "noisy.npz", scene=load_task("shift.yaml").scene)

@@ -35,7 +35,8 @@ from cpdeform.core.task import list_variants, read_task
 from cpdeform.core.testing.golden_file import read_golden
 from cpdeform.tasks import grid_import
 
-CASE_SECONDS = 10
+CASE_SECONDS, CASE_WAITING_SECONDS = 10, 120
+"""Seconds that a case may compute, and that it may take in all, on a machine that does other things, too."""
 
 
 class TooLongError(BaseException):
@@ -209,7 +210,8 @@ def run(kind: str, count: int, seed: int, directory: Path) -> dict[str, Any]:
     for index in range(count):
         began = time.monotonic()
         sys.stderr.write(f"{kind} {index}\n")
-        signal.alarm(CASE_SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, CASE_SECONDS)
+        signal.alarm(CASE_WAITING_SECONDS)
         try:
             getattr(campaign, kind)()
             found["accepted"] += 1
@@ -220,6 +222,7 @@ def run(kind: str, count: int, seed: int, directory: Path) -> dict[str, Any]:
         except (Exception, TooLongError, SystemExit):
             found["faults"].append(f"{index}: {traceback.format_exc()[-1500:]}")
         finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
             signal.alarm(0)
         found["longest"] = max(found["longest"], time.monotonic() - began)
     found["megabytes"] = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) / 1024
@@ -229,7 +232,8 @@ def run(kind: str, count: int, seed: int, directory: Path) -> dict[str, Any]:
 def main(kinds: str, count: int, seed: int, directory: Path) -> list[dict[str, Any]]:
     """Read `count` damaged inputs of each kind."""
     make_bases(directory / "bases")
-    signal.signal(signal.SIGALRM, stop)
+    for number in (signal.SIGALRM, signal.SIGPROF):
+        signal.signal(number, stop)
     return [run(kind, count, seed, directory) for kind in kinds.split(",")]
 
 
