@@ -11,7 +11,7 @@ OUT ?= runs/first
 
 SANITIZED := plugins/cpdeform-native/build/sanitized
 
-.PHONY: run test quick lint targets sanitize clean
+.PHONY: run test quick faults lint targets sanitize clean
 
 run: $(NATIVE)
 	$(BIN)/cpdeform run writer --out $(OUT) --overwrite
@@ -25,6 +25,10 @@ endif
 
 quick: $(NATIVE)
 	$(BIN)/python -m pytest -m "not slow"
+
+# 12,000 damaged files and options, some minutes; `make test` tries a part of them.
+faults: $(NATIVE)
+	$(BIN)/python -m pytest -m faults
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -8,6 +8,7 @@ from torch import Tensor
 from cpdeform.core.errors import InputError
 from cpdeform.core.final_gradient import add_final_gradient, check_final_gradient
 from cpdeform.core.machine import available_cores
+from cpdeform.core.options import MOST_THREADS, whole_number
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import Simulator, Trajectory
 from cpdeform.core.state import State
@@ -41,12 +42,8 @@ class SimulatorCheckpointing(Simulator):
         memory_budget: int,
     ) -> None:
         super().__init__(scene, batch_size=batch_size, device=device, dtype=dtype)
-        if threads is not None and threads < 1:
-            raise InputError("threads", came=str(threads), expected="at least 1")
-        if memory_budget < 0:
-            raise InputError("memory_budget", came=str(memory_budget), expected="a number of bytes, 0 or more")
-        self.threads = threads or available_cores()
-        self.memory_budget = memory_budget
+        self.threads = available_cores() if threads is None else whole_number("threads", threads, least=1, most=MOST_THREADS)
+        self.memory_budget = whole_number("memory_budget", memory_budget, least=0, most=2**60)
 
     def _own(self, tensor: Tensor) -> Tensor:
         """A copy of a tensor on the simulator's device and in its type, which the caller cannot write to."""

@@ -40,6 +40,13 @@ class ErrorGroup(TyperGroup):
                 raise
             typer.echo(f"cpdeform: error: {line}", err=True)
             raise typer.Exit(2) from error
+        except (MemoryError, RuntimeError) as error:
+            if not isinstance(error, MemoryError) and "allocate memory" not in str(error) and "out of memory" not in str(error):
+                raise
+            # Torch raises a RuntimeError where the memory does not suffice.
+            remedy = "Take fewer particles, steps, or worlds at a time (--set simulator_options.batch_size=1)."
+            typer.echo(f"cpdeform: error: not enough memory. {remedy}", err=True)
+            raise typer.Exit(2) from error
         except KeyboardInterrupt as error:
             typer.echo("cpdeform: interrupted", err=True)
             raise typer.Exit(130) from error

@@ -40,11 +40,12 @@ def import_grid_command(
 
     The goal's particles are an even sample whose own node masses are the grid's; the file keeps the grid, too.
     """
+    from cpdeform.core.bounded import MOST_SEED
     from cpdeform.core.errors import InputError
     from cpdeform.tasks.grid_import import import_grids
 
-    if seed < 0:
-        raise InputError("--seed", came=str(seed), expected="0 or more")
+    if not 0 <= seed <= MOST_SEED:
+        raise InputError("--seed", came=str(seed), expected=f"0 or more, at most {MOST_SEED}")
     if not every:
         _import_one(file, out, task, name, particles, seed, overwrite=overwrite)
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from cpdeform.core.bounded import Real
 from cpdeform.core.model import FrozenModel, PositiveFloat
 
 
@@ -17,7 +18,7 @@ class Material(FrozenModel):
     """
 
     youngs_modulus: PositiveFloat = 5000.0
-    poisson_ratio: float = Field(default=0.2, gt=-1.0, lt=0.5)
+    poisson_ratio: Real = Field(default=0.2, gt=-1.0, lt=0.5)
     yield_stress: PositiveFloat = 50.0
 
     @property

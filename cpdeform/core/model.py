@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pydantic import BaseModel, ConfigDict
 
-from pydantic import BaseModel, ConfigDict, Field
+from cpdeform.core.bounded import Coordinate, NonNegativeFloat, PositiveFloat, Real
 
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NonNegativeFloat = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+__all__ = ["FrozenModel", "NonNegativeFloat", "PositiveFloat", "Quaternion", "Vector3"]
+
+Vector3 = tuple[Coordinate, Coordinate, Coordinate]
+Quaternion = tuple[Real, Real, Real, Real]
 
 
 class FrozenModel(BaseModel):

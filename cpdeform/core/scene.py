@@ -13,6 +13,14 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from cpdeform.core.bounded import (
+    MOST_PARTICLES,
+    MOST_PARTS,
+    MOST_STEPS,
+    Real,
+    Seed,
+    Whole,
+)
 from cpdeform.core.errors import InputError
 from cpdeform.core.material import Material
 from cpdeform.core.model import FrozenModel, NonNegativeFloat, PositiveFloat, Quaternion, Vector3
@@ -76,19 +84,26 @@ class Scene(FrozenModel):
         sampling_seed: Seed of the particle positions inside the bodies.
     """
 
-    bodies: tuple[Body, ...] = Field(min_length=1)
-    manipulators: tuple[Manipulator, ...] = ()
+    bodies: tuple[Body, ...] = Field(min_length=1, max_length=MOST_PARTS)
+    manipulators: tuple[Manipulator, ...] = Field(default=(), max_length=MOST_PARTS)
     material: Material = Material()
     gravity_parameter: Vector3 = (0.0, -1.0, 0.0)
-    gravity_scale: NonNegativeFloat = 30.0
+    gravity_scale: Real = Field(default=30.0, ge=0.0, le=1e6)
     ground_friction: NonNegativeFloat = 1.5
-    ground_height: NonNegativeFloat = 0.0
-    grid_size: int = Field(default=64, ge=8, le=512)
-    time_step: PositiveFloat = 1e-4
-    substeps: int = Field(default=19, ge=1)
-    softness: NonNegativeFloat = 666.0
+    ground_height: Real = Field(default=0.0, ge=0.0, le=1.0)
+    grid_size: Whole = Field(default=64, ge=8, le=512)
+    time_step: Real = Field(default=1e-4, ge=1e-12, le=1.0)
+    substeps: Whole = Field(default=19, ge=1, le=MOST_STEPS)
+    softness: Real = Field(default=666.0, ge=0.0, le=1e9)
     sampling: Literal["uniform", "plasticinelab"] = "uniform"
-    sampling_seed: int = Field(default=0, ge=0, le=2**32 - 1)
+    sampling_seed: Seed = Field(default=0, le=2**32 - 1)
+
+    @model_validator(mode="after")
+    def _check_particle_count(self) -> Scene:
+        if self.particle_count > MOST_PARTICLES:
+            came = f"{self.particle_count} particles of all bodies"
+            raise InputError("bodies", came=came, expected=f"at most {MOST_PARTICLES}")
+        return self
 
     @model_validator(mode="after")
     def _check_bodies_inside(self) -> Scene:

@@ -13,12 +13,16 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from cpdeform.core.errors import CapabilityError, InputError
+from cpdeform.core.errors import CapabilityError, InputError, brief
 from cpdeform.core.final_gradient import pull_back, state_tensors
 from cpdeform.core.forking import prepare_for_forks
+from cpdeform.core.options import whole_number
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator_inputs import check_values
 from cpdeform.core.state import State, initial_state
+
+MOST_WORLDS = 1_000_000
+"""Worlds of a batch at most."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +96,7 @@ class Simulator(abc.ABC):
 
     Raises:
         CapabilityError: The backend does not support the device, the type or a manipulator of the scene.
-        InputError: `batch_size` is below 1, or CUDA is asked for where there is none.
+        InputError: `batch_size` is below 1 or no number, `device` is no device, or CUDA is asked for where there is none.
     """
 
     capabilities: ClassVar[SimulatorCapabilities]
@@ -102,11 +106,9 @@ class Simulator(abc.ABC):
     ) -> None:
         prepare_for_forks()
         self.scene = scene
-        self.batch_size = batch_size
-        self.device = torch.device(device)
+        self.batch_size = whole_number("batch_size", batch_size, least=1, most=MOST_WORLDS)
+        self.device = _device(device)
         self.dtype = dtype or self.capabilities.dtypes[0]
-        if batch_size < 1:
-            raise InputError("batch_size", came=str(batch_size), expected="at least 1 world")
         self._check_capabilities()
 
     def _check_capabilities(self) -> None:
@@ -214,6 +216,14 @@ class Simulator(abc.ABC):
 
     def release_memory(self) -> None:  # noqa: B027 - most backends keep nothing
         """Give back to the system what is kept between rollouts to be used again; trajectories stay usable."""
+
+
+def _device(device: torch.device | str) -> torch.device:
+    """The device of a name."""
+    try:
+        return torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise InputError("device", came=brief(repr(device), 60), expected='"cpu", "cuda" or "cuda:N"') from error
 
 
 class _RolloutFunction(torch.autograd.Function):

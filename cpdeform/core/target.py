@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import io
 import zipfile
-import zlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.reading.arrays import check_bytes, open_arrays
+from cpdeform.core.reading.limits import ReadingLimits
 from cpdeform.core.scene import Scene
+
+_EXPECTED = "an .npz, .npy or .h5 file of target particles"
 
 POSITION_SCALE = 2**16
 """Integer positions in a file are whole multiples of 1/POSITION_SCALE, length units."""
 
 
-def load_target(path: Path, *, scene: Scene) -> NDArray[np.float64]:
+def load_target(path: Path, *, scene: Scene, limits: ReadingLimits | None = None) -> NDArray[np.float64]:
     """Read target particles from ``.npz`` or ``.h5`` with an array ``position`` (M, 3), or from ``.npy`` with such an array.
 
     Integer arrays are positions in units of 2^-16 (compact files), others are in length units.
@@ -28,21 +29,23 @@ def load_target(path: Path, *, scene: Scene) -> NDArray[np.float64]:
     Args:
         path: The file.
         scene: Its domain must hold the target.
+        limits: How large it may be; defaults to `cpdeform.core.reading.limits.default_limits`.
 
     Returns:
         Positions (M, 3), length units.
 
     Raises:
-        InputError: The file is missing or unreadable, or holds something else than finite positions in the domain.
+        InputError: The file is missing, unreadable or too large, or holds something else than finite positions in the domain.
     """
     argument = f"target file {path}"
-    with _arrays(path) as arrays:
-        if "position" not in arrays:
+    with open_arrays(path, argument=argument, expected=_EXPECTED, limits=limits) as file:
+        if "position" not in file:
             raise InputError(argument, came="no array of that name", expected='an array "position" of shape (M, 3)')
-        values = np.asarray(arrays["position"])
-    if values.ndim != 2 or values.shape[1] != 3 or not len(values) or values.dtype.kind not in "fui":
-        raise InputError(argument, came=f"{values.dtype} of shape {values.shape}", expected="positions of shape (M, 3), M >= 1")
-    positions = values.astype(np.float64) / (1.0 if values.dtype.kind == "f" else POSITION_SCALE)
+        values = file.read("position", shape=("M", 3), finite=False, meaning="positions")
+    if not len(values):
+        raise InputError(argument, came="positions of shape (0, 3)", expected="positions of shape (M, 3), M >= 1")
+    with np.errstate(all="ignore"):
+        positions = values.astype(np.float64) / (1.0 if values.dtype.kind == "f" else POSITION_SCALE)
     bad = int((~np.isfinite(positions)).any(axis=1).sum())
     if bad:
         came = f"{bad} particles with nan or infinity"
@@ -59,35 +62,56 @@ def load_target(path: Path, *, scene: Scene) -> NDArray[np.float64]:
     return positions
 
 
-def load_target_grid(path: Path, *, scene: Scene) -> NDArray[np.float64] | None:
+def load_target_grid(path: Path, *, scene: Scene, limits: ReadingLimits | None = None) -> NDArray[np.float64] | None:
     """Read the node masses of a goal file: arrays ``grid_cells`` (K, 3), node indices, and ``grid_mass`` (K,).
 
     Args:
         path: The file.
         scene: Its grid is the one that the masses belong to.
+        limits: As for `load_target`.
 
     Returns:
         Node masses (G, G, G); None where the file holds none.
 
     Raises:
-        InputError: The file is missing or unreadable, or the masses do not fit the scene's grid.
+        InputError: The file is missing, unreadable or too large, or the masses do not fit the scene's grid.
     """
     argument = f"target file {path}"
-    with _arrays(path) as arrays:
-        if "grid_cells" not in arrays or "grid_mass" not in arrays:
+    with open_arrays(path, argument=argument, expected=_EXPECTED, limits=limits) as file:
+        if not file.names or "grid_cells" not in file or "grid_mass" not in file:
             return None
-        cells, masses = np.asarray(arrays["grid_cells"]), np.asarray(arrays["grid_mass"], dtype=np.float64)
-    if cells.ndim != 2 or cells.shape[1] != 3 or masses.shape != cells.shape[:1] or cells.dtype.kind not in "ui":
-        came = f"grid_cells {cells.dtype} {cells.shape}, grid_mass {masses.shape}"
-        raise InputError(argument, came=came, expected="node indices (K, 3) and masses (K,)")
-    if len(cells) and int(cells.max()) >= scene.grid_size:
-        came, expected = f"a node index {int(cells.max())}", f"indices below the scene's grid_size {scene.grid_size}"
-        raise InputError(argument, came=came, expected=expected, remedy="Import the grid anew for this scene.")
-    if not np.isfinite(masses).all() or (masses < 0.0).any():
-        raise InputError(argument, came="negative or non-finite masses", expected="finite masses of at least 0")
-    grid = np.zeros((scene.grid_size,) * 3)
-    grid[tuple(cells.astype(np.int64).T)] = masses
-    return grid
+        cells = file.read("grid_cells", shape=("K", 3), kinds="ui", meaning="node indices")
+        masses = file.read("grid_mass", shape=("K",), meaning="masses").astype(np.float64)
+    if (masses < 0.0).any():
+        raise InputError(f"{argument}: grid_mass", came="negative masses", expected="finite masses of at least 0")
+    remedy = "Import the grid anew for this scene."
+    return dense_grid(cells, masses, scene.grid_size, argument=f"{argument}: grid_cells", remedy=remedy)
+
+
+def dense_grid(cells: NDArray[Any], masses: NDArray[Any], size: int, *, argument: str, remedy: str = "") -> NDArray[np.float64]:
+    """Node masses (G, G, G) of those that are not 0.
+
+    Args:
+        cells: Node indices (K, 3), each once.
+        masses: Their masses (K,).
+        size: Number of nodes G along an axis.
+        argument: What the indices are, for messages.
+        remedy: What the user can do where they do not fit.
+
+    Raises:
+        InputError: An index lies outside of the grid or comes twice, or the grid is too large.
+    """
+    if len(cells) and not (int(cells.min()) >= 0 and int(cells.max()) < size):
+        came = f"a node index {int(cells.min()) if int(cells.min()) < 0 else int(cells.max())}"
+        raise InputError(argument, came=came, expected=f"indices from 0 to {size - 1} (grid_size {size})", remedy=remedy)
+    check_bytes(8 * size**3, argument=argument, came=f"a grid of {size} nodes along an axis")
+    flat = np.ravel_multi_index(tuple(cells.astype(np.int64).T), (size,) * 3)
+    if len(np.unique(flat)) != len(flat):
+        came = f"{len(flat) - len(np.unique(flat))} nodes more than once"
+        raise InputError(argument, came=came, expected="each node once", remedy=remedy)
+    grid = np.zeros(size**3)
+    grid[flat] = masses
+    return grid.reshape((size,) * 3)
 
 
 def load_correspondence(path: Path) -> bool:
@@ -99,10 +123,10 @@ def load_correspondence(path: Path) -> bool:
         path: The file.
 
     Raises:
-        InputError: The file is missing or unreadable.
+        InputError: The file is missing or unreadable, or the array is no single truth value.
     """
-    with _arrays(path) as arrays:
-        return "corresponds" in arrays and bool(np.asarray(arrays["corresponds"]).all())
+    with open_arrays(path, argument=f"target file {path}", expected=_EXPECTED) as file:
+        return bool(file.names) and "corresponds" in file and bool(file.read("corresponds", shape=(), kinds="b"))
 
 
 def write_target(
@@ -130,26 +154,3 @@ def write_target(
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, values, allow_pickle=False)
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), buffer.getvalue(), zipfile.ZIP_DEFLATED, 9)
-
-
-@contextmanager
-def _arrays(path: Path) -> Iterator[Mapping[str, Any]]:
-    """The arrays in a file by name; whatever makes it unreadable becomes an `InputError`."""
-    argument = f"target file {path}"
-    try:
-        # Opened here, since numpy leaves the file open where it turns out to be a damaged archive.
-        with path.open("rb") as file:
-            if path.suffix == ".h5":
-                import h5py
-
-                with h5py.File(file, "r") as content:
-                    yield content
-            else:
-                loaded = np.load(file, allow_pickle=False)
-                yield loaded if isinstance(loaded, np.lib.npyio.NpzFile) else {"position": np.asarray(loaded)}
-    except FileNotFoundError as error:
-        raise InputError(argument, came="no such file", expected="an .npz or .npy file of target particles") from error
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(argument, came=f"unreadable content ({error})", expected="an .npz or .npy file of numbers") from error

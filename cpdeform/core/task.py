@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import Field
 
+from cpdeform.core.bounded import MOST_STAGES, MOST_STEPS, Name, Whole
 from cpdeform.core.errors import InputError, PluginError, UnknownNameError
-from cpdeform.core.plugins import Registry, load_registry
+from cpdeform.core.plugins import Registry, describe, load_registry, redirect_prints
+from cpdeform.core.reading.models import validate
+from cpdeform.core.reading.yaml_text import read_yaml
 from cpdeform.core.scene import FrozenModel, Scene
 from cpdeform.core.target import load_correspondence, load_target, load_target_grid
 
@@ -29,8 +31,6 @@ __all__ = [
     "task_path",
     "validate",
 ]
-
-Model = TypeVar("Model", bound=BaseModel)
 
 
 class Task(FrozenModel):
@@ -50,13 +50,13 @@ class Task(FrozenModel):
             scene itself stays the benchmark's; see `limited_task`.
     """
 
-    name: str
-    summary: str = ""
+    name: Name
+    summary: str = Field(default="", max_length=10_000)
     scene: Scene
     target: Path
-    step_count: int = Field(default=10, ge=1)
-    rest_steps: int = Field(default=0, ge=0)
-    stage_count: int = Field(default=1, ge=1)
+    step_count: Whole = Field(default=10, ge=1, le=MOST_STEPS)
+    rest_steps: Whole = Field(default=0, ge=0, le=MOST_STEPS)
+    stage_count: Whole = Field(default=1, ge=1, le=MOST_STAGES)
     metric: Literal["incremental_iou", "wasserstein"] = "wasserstein"
     limits: dict[str, Any] = Field(default_factory=dict)
 
@@ -113,82 +113,18 @@ def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]
 def _merge_list(name: str, base: list[Any] | tuple[Any, ...], changes: Mapping[str, Any]) -> list[Any]:
     items = list(base)
     for key, value in changes.items():
-        index = int(key) if str(key).isdigit() else -1
+        digits = str(key)
+        index = int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 10 else -1
         if not 0 <= index < len(items):
             raise InputError(f"{name}.{key}", came=f'"{key}"', expected=f"an index from 0 to {len(items) - 1}")
         items[index] = merge(items[index], value) if isinstance(value, Mapping) and isinstance(items[index], Mapping) else value
     return items
 
 
-def validate(model: type[Model], data: Any, *, source: str) -> Model:
-    """Build a pydantic model; its errors become one `InputError` that names the field.
-
-    Args:
-        model: The model class.
-        data: What to read it from.
-        source: Where the data come from, for the message.
-
-    Raises:
-        InputError: The data do not fit the model.
-    """
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = ".".join(str(part) for part in first["loc"]) or "content"
-        if first["type"] == "extra_forbidden":
-            *path, name = first["loc"]
-            raise UnknownNameError(f"{source}: field {field}", str(name), _field_names(model, path)) from error
-        cause = first.get("ctx", {}).get("error")
-        if isinstance(cause, InputError):
-            parts = [str(part) for part in first["loc"]]
-            place = ".".join(parts if parts and parts[-1] == cause.argument else [*parts, cause.argument])
-            raise InputError(f"{source}: {place}", came=cause.came, expected=cause.expected, remedy=cause.remedy) from error
-        came = repr(first["input"])
-        message = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-        if message.startswith(("greater", "less")):
-            message = f"a value {message}"
-        count = error.error_count() - 1
-        more = f" ({count} more error{'s' if count > 1 else ''})" if count else ""
-        raise InputError(
-            f"{source}: {field}",
-            came=came if len(came) <= 120 else came[:117] + "...",
-            expected=message[0].lower() + message[1:] + more,
-        ) from error
-
-
-def _field_names(model: type[BaseModel], path: Sequence[int | str]) -> list[str]:
-    """Names of the fields at a path of a validation error: field names, list indices, and tags that choose from a union."""
-    models = {model}
-    for part in path:
-        if isinstance(part, int):
-            continue
-        annotations = [item.model_fields[part].annotation for item in models if part in item.model_fields]
-        if annotations:
-            models = set().union(*(_models_in(annotation) for annotation in annotations))
-        else:
-            models = {item for item in models if "kind" in item.model_fields and item.model_fields["kind"].default == part}
-    return sorted({name for item in models for name in item.model_fields})
-
-
-def _models_in(annotation: Any) -> set[type[BaseModel]]:
-    """All models that a type annotation mentions."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return {annotation}
-    return set().union(*(_models_in(part) for part in get_args(annotation)))
-
-
 def _read_mapping(path: Path) -> dict[str, Any]:
     """Content of a task file, not validated beyond being a mapping."""
     argument = f"task file {path}"
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(argument, came="no such file", expected="a YAML file") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(argument, came=f"unreadable content ({error})", expected="a YAML file") from error
-    except (yaml.YAMLError, ValueError) as error:
-        raise InputError(argument, came=f"malformed YAML ({' '.join(str(error).split())})", expected="YAML") from error
+    content = read_yaml(path, argument=argument)
     if not isinstance(content, dict):
         raise InputError(argument, came=type(content).__name__, expected="a mapping with the fields of a task")
     return content
@@ -296,9 +232,12 @@ def task_path(name: str, *, registry: Registry) -> Path:
     """
     package, _, file = registry.find("task", name).spec.target.partition(":")
     try:
-        return Path(str(importlib.resources.files(package) / file))
-    except Exception as error:
-        raise PluginError(f'task "{name}": cannot import {package}: {type(error).__name__}: {error}') from error
+        with redirect_prints():
+            return Path(str(importlib.resources.files(package) / file))
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise PluginError(f'task "{name}": cannot import {package}: {describe(error)}') from error
 
 
 def load_task(name: str | Path, *, registry: Registry | None = None) -> Task:

@@ -11,6 +11,7 @@ from typing import Any
 
 from cpdeform import __version__
 from cpdeform.core.errors import CpdeformError, InputError
+from cpdeform.core.reading.json_text import read_json
 from cpdeform.experiments.experiment_plan import PlannedRun
 from cpdeform.planning.result import Status
 from cpdeform.run.record_files import replacing, to_json, write_json
@@ -120,10 +121,13 @@ def read_row(run: PlannedRun, *, paper_metric: bool, reused: bool) -> Experiment
     """
     base: dict[str, Any] = {"task": run.task, "method": run.method, "seed": run.seed, "reused": reused}
     try:
-        failure = json.loads((run.directory / FAILURE_FILE).read_text(encoding="utf-8"))
-        return ExperimentRow(**base, status="failed", reason=failure["reason"])
-    except FileNotFoundError:
-        pass
+        missing = not (run.directory / FAILURE_FILE).exists()
+        failure = None if missing else read_json(run.directory / FAILURE_FILE, argument=str(run.directory / FAILURE_FILE))
+    except InputError as error:
+        failure = {"reason": str(error)}
+    if failure is not None:
+        reason = failure.get("reason") if isinstance(failure, dict) else None
+        return ExperimentRow(**base, status="failed", reason=str(reason or "unknown"))
     if not run.directory.exists():
         return ExperimentRow(**base, status="not_run")
     try:
@@ -204,8 +208,8 @@ def _figures(record: RunRecord, *, paper_metric: bool) -> dict[str, Any]:
     """Figures of a record: those beside it where they belong to it, else computed and kept there."""
     path = record.directory / EVALUATION_FILE
     key = {"recorded_at": record.run.get("recorded_at"), "stages": len(record.stages), "version": __version__}
-    with contextlib.suppress(OSError, ValueError, KeyError):
-        kept = json.loads(path.read_text(encoding="utf-8"))
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        kept = read_json(path, argument=str(path))
         if kept["key"] == key and (kept["paper_metric"] or not paper_metric):
             return {name: kept["figures"][name] for name in FIGURES}
     figures = judge(record, paper_metric=paper_metric)

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from cpdeform.core.reading.json_text import read_json
 from cpdeform.experiments.experiment import family
 from cpdeform.experiments.experiment_plan import METHODS, MULTI_STAGE, OWN_OPTIONS, SINGLE_STAGE
 from cpdeform.experiments.experiment_row import ExperimentRow
@@ -266,9 +267,9 @@ def _session_lines(sessions: Iterable[Mapping[str, Any]]) -> list[str]:
 def read_sessions(out: Path) -> list[dict[str, Any]]:
     """Who made the runs of a directory: command, machine and versions of each session that ran something."""
     try:
-        sessions: list[dict[str, Any]] = json.loads((out / SESSIONS_FILE).read_text(encoding="utf-8"))["sessions"]
+        sessions: list[dict[str, Any]] = read_json(out / SESSIONS_FILE, argument=str(out / SESSIONS_FILE))["sessions"]
         return sessions
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError):
         return []
 
 

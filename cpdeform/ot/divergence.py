@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.options import real_number, whole_number
 from cpdeform.core.ot import OTResult, check_blur, check_problem, fix_gauge
 from cpdeform.ot.softmin import soft_minimum, soft_minimum_gradient
+
+LEAST_BLUR = 1e-6
+"""Smallest blur, length units: a thousandth of the distance between particles; below it a solution takes hours."""
+
+MOST_ITERATIONS = 1_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,15 +132,13 @@ class Potentials:
 
 def check_options(*, blur: float, exponent: int, tolerance: float, iterations: int, warm_iterations: int) -> None:
     """Raise InputError for options out of range."""
-    if not (math.isfinite(blur) and blur > 0):
-        raise InputError("blur", came=f"{blur}", expected="a positive length", remedy="Usual values lie between 1e-3 and 1e-2.")
-    if exponent not in (1, 2):
+    remedy = "Usual values lie between 1e-3 and 1e-2."
+    real_number("blur", blur, least=LEAST_BLUR, most=1000.0, expected="a positive length", remedy=remedy)
+    if isinstance(exponent, bool) or exponent not in (1, 2):
         raise InputError("exponent", came=f"{exponent}", expected="1 or 2")
-    if not (math.isfinite(tolerance) and 0 < tolerance < 1):
-        raise InputError("tolerance", came=f"{tolerance}", expected="a number between 0 and 1")
+    real_number("tolerance", tolerance, least=1e-12, most=1.0 - 1e-12, expected="a number between 0 and 1")
     for name, count in (("iterations", iterations), ("warm_iterations", warm_iterations)):
-        if count < 1:
-            raise InputError(name, came=f"{count}", expected="at least 1")
+        whole_number(name, count, least=1, most=MOST_ITERATIONS)
 
 
 def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:

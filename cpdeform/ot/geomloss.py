@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.forking import prepare_for_forks
+from cpdeform.core.options import real_number
 from cpdeform.core.ot import OTCapabilities, OTResult, OTSolver, fix_gauge
 from cpdeform.ot.annealing import Schedule, solve_cold
 from cpdeform.ot.divergence import Potentials, Problem, check_choice, check_options, finish, usable_state, warm_potentials
@@ -82,8 +83,7 @@ class OTSolverGeomLoss(OTSolver):
         prepare_for_forks()
         check_options(blur=blur, exponent=exponent, tolerance=tolerance, iterations=iterations, warm_iterations=warm_iterations)
         check_choice("settings", settings, ("converged", "paper"))
-        if not 0 < scaling < 1:
-            raise InputError("scaling", came=f"{scaling}", expected="a number between 0 and 1", remedy="GeomLoss's default is 0.5.")
+        real_number("scaling", scaling, least=1e-3, most=0.99, expected="a number between 0 and 1")
         if settings == "paper" and exponent != 1:
             raise InputError("exponent", came=f"{exponent}", expected='1 with settings="paper", as in the paper')
         self.blur = float(blur)

@@ -11,8 +11,8 @@ import ot
 import torch
 from torch import Tensor
 
-from cpdeform.core.errors import InputError
 from cpdeform.core.forking import prepare_for_forks
+from cpdeform.core.options import real_number
 from cpdeform.core.ot import OTCapabilities, OTResult, OTSolver
 from cpdeform.ot.annealing import Schedule, solve_cold
 from cpdeform.ot.divergence import Problem, check_choice, check_options, finish, usable_state, warm_potentials
@@ -87,8 +87,7 @@ class OTSolverPOT(OTSolver):
         check_options(blur=blur, exponent=exponent, tolerance=tolerance, iterations=iterations, warm_iterations=warm_iterations)
         check_choice("value", value, ("entropic", "exact"))
         check_choice("method", method, ("sinkhorn_stabilized", "sinkhorn_log"))
-        if not 0 < scaling < 1:
-            raise InputError("scaling", came=f"{scaling}", expected="a number between 0 and 1")
+        real_number("scaling", scaling, least=1e-3, most=0.99, expected="a number between 0 and 1")
         self.blur = float(blur)
         self.exponent = exponent
         self.debias = debias

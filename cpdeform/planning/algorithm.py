@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.memory_limit import check_memory
 from cpdeform.core.objective import Objective
 from cpdeform.core.ot import OTSolver, TransportProblem
 from cpdeform.core.placer import LEAST_GAIN, Candidate, Placer, Stage
@@ -107,16 +108,17 @@ class Planner:
 
         Raises:
             CapabilityError: The parts do not fit together.
-            InputError: `stages` or `first_stage` is out of range, the goal or `state` cannot be used, or a tool starts inside the
-                body.
+            InputError: `stages` or `first_stage` is out of range, the goal or `state` cannot be used, a tool starts inside the
+                body, or there is not enough memory.
         """
         count = self.task.stage_count if stages is None else stages
-        check_run(count, first_stage)
+        check_run(count, first_stage, self.seed)
         check_parts(self.task, self.simulator, self.placer, self.ot_solver, problem=self.problem or self.placer.transport_problem)
         if not self._phases("round"):
             raise InputError(
                 "phases", came="none that works on a round of candidates", expected="at least one, such as PhaseDescent"
             )
+        check_memory(self.simulator, step_count=self.task.rollout_steps, worlds=1)
         scene_start = self.simulator.initial_state(batch_size=1)
         check_tools_outside(self.task.scene, scene_start)
         state = scene_start if state is None else check_start(self.task, self.simulator, state)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import torch
 
+from cpdeform.core.bounded import MOST_COUNT, MOST_SEED, MOST_STAGES
 from cpdeform.core.errors import CapabilityError, InputError
+from cpdeform.core.options import whole_number
 from cpdeform.core.ot import OTSolver, TransportProblem
 from cpdeform.core.placer import Placer
 from cpdeform.core.scene import Scene
@@ -43,12 +45,11 @@ def check_parts(task: Task, simulator: Simulator, placer: Placer, ot_solver: OTS
         raise InputError("simulator", came="a simulator of another scene", expected="one built from task.scene")
 
 
-def check_run(stages: int, first_stage: int) -> None:
-    """Raise `InputError` unless the numbers of stages make sense."""
-    if stages < 1:
-        raise InputError("stages", came=str(stages), expected="at least 1")
-    if first_stage < 0:
-        raise InputError("first_stage", came=str(first_stage), expected="0 or more")
+def check_run(stages: int, first_stage: int, seed: int) -> None:
+    """Raise `InputError` unless the numbers of stages and the seed make sense."""
+    whole_number("stages", stages, least=1, most=MOST_STAGES)
+    whole_number("first_stage", first_stage, least=0, most=MOST_COUNT)
+    whole_number("seed", seed, least=0, most=MOST_SEED)
 
 
 def check_start(task: Task, simulator: Simulator, state: State) -> State:

@@ -8,9 +8,10 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from cpdeform.core.errors import InputError
+from cpdeform.core.bounded import MOST_COUNT
 from cpdeform.core.memory import MemoryUse
 from cpdeform.core.objective import Objective
+from cpdeform.core.options import real_number, whole_number
 from cpdeform.core.simulator import Simulator
 from cpdeform.core.state import State
 from cpdeform.planning.batches import Evaluator
@@ -89,15 +90,13 @@ class TrajectoryOptimizer:
     backtrack: int | None = 4
 
     def __post_init__(self) -> None:
-        limits = {"iterations": self.iterations >= 1, "learning_rate": self.learning_rate > 0, "patience": self.patience >= 1}
-        for name, fine in limits.items():
-            if not fine:
-                raise InputError(f"optimizer.{name}", came=str(getattr(self, name)), expected="a positive number")
-        if self.backtrack is not None and self.backtrack < 1:
-            raise InputError("optimizer.backtrack", came=str(self.backtrack), expected="at least 1, or None")
+        for name in ("iterations", "patience"):
+            whole_number(f"optimizer.{name}", getattr(self, name), least=1, most=MOST_COUNT)
+        if self.backtrack is not None:
+            whole_number("optimizer.backtrack", self.backtrack, least=1, most=MOST_COUNT)
+        real_number("optimizer.learning_rate", self.learning_rate, least=1e-12, most=1e15, expected="a positive number")
         for name in ("tolerance", "initial_noise"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"optimizer.{name}", came=str(getattr(self, name)), expected="zero or more")
+            real_number(f"optimizer.{name}", getattr(self, name), least=0.0, most=1e15, expected="zero or more")
 
     def initial_actions(self, shape: tuple[int, int, int], generator: torch.Generator) -> Tensor:
         """First actions (B, T, A): small Gaussian noise, clipped to [-1, 1]."""

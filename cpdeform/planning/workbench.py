@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.final_gradient import state_tensors
+from cpdeform.core.memory_limit import check_memory
 from cpdeform.core.objective import Objective
 from cpdeform.core.placer import Candidate, Stage
 from cpdeform.core.simulator import Simulator, Trajectory
@@ -173,6 +174,7 @@ class Workbench:
 
     def _announce(self, worlds: int) -> None:
         room = min(worlds, self.simulator.batch_size)
+        check_memory(self.simulator, step_count=self.task.rollout_steps, worlds=room)
         self.on_batch(room, self.simulator.memory_estimate(self.task.rollout_steps, worlds=room))
 
 

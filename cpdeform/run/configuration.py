@@ -6,10 +6,20 @@ import re
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, PositiveFloat, field_validator
+from pydantic import Field, field_validator
 
+from cpdeform.core.bounded import (
+    MOST_COUNT,
+    MOST_STAGES,
+    MOST_STEPS,
+    Count,
+    Length,
+    NonNegativeFloat,
+    PositiveFloat,
+    Seed,
+    Whole,
+)
 from cpdeform.core.errors import InputError
-from cpdeform.core.ot import LEAST_RELATIVE_BLUR
 from cpdeform.core.plugins import AUTO
 from cpdeform.core.scene import FrozenModel
 from cpdeform.planning.objectives.contact import ContactKind
@@ -20,13 +30,13 @@ DEFAULT_STRATEGY = "cpdeform"
 class OptimizerConfiguration(FrozenModel):
     """Options of `cpdeform.planning.optimizer.TrajectoryOptimizer`; see there. `pruner` is a name of `make_pruner`."""
 
-    iterations: int = Field(default=40, ge=1)
-    learning_rate: float = Field(default=0.1, gt=0.0)
-    patience: int = Field(default=15, ge=1)
-    tolerance: float = Field(default=1e-3, ge=0.0)
-    initial_noise: float = Field(default=0.01, ge=0.0)
+    iterations: Count = 40
+    learning_rate: PositiveFloat = 0.1
+    patience: Count = 15
+    tolerance: NonNegativeFloat = 1e-3
+    initial_noise: NonNegativeFloat = 0.01
     pruner: Literal["halving", "none"] = "halving"
-    backtrack: int | None = Field(default=4, ge=1)
+    backtrack: Count | None = 4
 
 
 class PrioritiesConfiguration(FrozenModel):
@@ -42,7 +52,7 @@ class PrioritiesConfiguration(FrozenModel):
     """
 
     kind: Literal["potential", "displacement"] | None = None
-    blur: float | None = Field(default=None, ge=LEAST_RELATIVE_BLUR)
+    blur: Length | None = None
 
 
 class ObjectiveConfiguration(FrozenModel):
@@ -64,11 +74,11 @@ class ObjectiveConfiguration(FrozenModel):
     """
 
     kind: Literal["transport", "plasticinelab"] = "transport"
-    points: int | None = Field(default=10000, ge=1)
-    blur: float = Field(default=2e-3, ge=LEAST_RELATIVE_BLUR)
-    refresh: int = Field(default=50, ge=1)
-    contact_weight: float | None = Field(default=None, ge=0.0)
-    coast_steps: float = Field(default=0.0, ge=0.0)
+    points: Count | None = 10000
+    blur: Length = 2e-3
+    refresh: Count = 50
+    contact_weight: NonNegativeFloat | None = None
+    coast_steps: NonNegativeFloat = 0.0
     axis_scale: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (1.0, 1.0, 1.0)
     contact: ContactKind = "plasticinelab"
 
@@ -86,9 +96,9 @@ class RefinementConfiguration(FrozenModel):
     """
 
     kind: Literal["density", "iou", "transport"] = "density"
-    iterations: int = Field(default=0, ge=0)
-    learning_rate: float = Field(default=0.03, gt=0.0)
-    patience: int = Field(default=15, ge=1)
+    iterations: Whole = Field(default=0, ge=0, le=MOST_COUNT)
+    learning_rate: PositiveFloat = 0.03
+    patience: Count = 15
 
 
 class RunConfiguration(FrozenModel):
@@ -123,10 +133,10 @@ class RunConfiguration(FrozenModel):
     ot: str = AUTO
     placer: str = "transport"
     device: str = "cpu"
-    seed: int = Field(default=0, ge=0)
-    stages: int | None = Field(default=None, ge=1)
-    steps: int | None = Field(default=None, ge=1)
-    rest_steps: int | None = Field(default=None, ge=0)
+    seed: Seed = 0
+    stages: Whole | None = Field(default=None, ge=1, le=MOST_STAGES)
+    steps: Whole | None = Field(default=None, ge=1, le=MOST_STEPS)
+    rest_steps: Whole | None = Field(default=None, ge=0, le=MOST_STEPS)
     target: Path | None = None
     strategy: str = DEFAULT_STRATEGY
     optimizer: OptimizerConfiguration = OptimizerConfiguration()

@@ -36,7 +36,9 @@ class HookObserver(Observer):
             others = [other for other in plugins if other is not plugin]
             try:
                 self._manager.subset_hook_caller(hook, remove_plugins=others)(result=result)
-            except Exception as error:
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:
                 name = self._manager.get_name(plugin)
                 message = f"plugin {name}: {hook} failed with {type(error).__name__}: {error}. The run goes on."
                 warnings.warn(message, RuntimeWarning, stacklevel=2)

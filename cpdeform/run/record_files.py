@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
-import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
@@ -136,11 +134,6 @@ def write_dataset(group: h5py.Group, name: str, tensor: Tensor, *, shape: str, u
     dataset = group.create_dataset(name, data=values, **options)
     dataset.attrs["shape"] = shape
     dataset.attrs["units"] = units
-
-
-def read_tensor(group: h5py.Group, name: str) -> Tensor:
-    """Read a dataset as a tensor on the CPU."""
-    return torch.from_numpy(np.asarray(group[name][()]))
 
 
 def environment() -> dict[str, Any]:

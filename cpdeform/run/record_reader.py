@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
-import h5py
+import torch
+from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
+from cpdeform.core.bounded import MOST_SEED
 from cpdeform.core.errors import InputError
+from cpdeform.core.reading.arrays import open_arrays
+from cpdeform.core.reading.boundary import boundary
+from cpdeform.core.reading.json_text import read_json, read_json_lines
+from cpdeform.core.reading.limits import ReadingLimits, default_limits
+from cpdeform.core.reading.models import validate
 from cpdeform.core.state import State
-from cpdeform.core.task import Task, validate
+from cpdeform.core.task import Task
 from cpdeform.planning.result import StageResult, Status
 from cpdeform.run.migration import current_task
-from cpdeform.run.record_files import METRICS_FILE, RUN_FILE, TARGET_FILE, read_tensor, stage_files
+from cpdeform.run.record_files import METRICS_FILE, RUN_FILE, TARGET_FILE, stage_files
 from cpdeform.run.record_stage import read_stage
+
+MOST_BYTES = 2**32
+"""Bytes of a stage that a record's task alone does not allow for."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,49 +82,78 @@ class RunRecord:
         return self.stages[-1].state
 
 
-def load_record(directory: Path | str) -> RunRecord:
+def load_record(directory: Path | str, *, limits: ReadingLimits | None = None) -> RunRecord:
     """Read a run record, of a run that is over, goes on, or was killed.
 
     Args:
         directory: What `RunRecorder` or `DeformResult.save` wrote.
+        limits: How large its files may be; defaults to `cpdeform.core.reading.limits.default_limits`, or to what a stage of the
+            record's task takes, if that is more.
 
     Raises:
-        InputError: There is no record, or a file of it is damaged.
+        InputError: There is no record, or a file of it is damaged or too large.
     """
     directory = Path(directory)
-    run = _read_run(directory)
     argument = f"run record {directory}"
-    try:
-        content = current_task(run["task"], record_format=run.get("format", 1))
-        task = validate(Task, content, source=f"{argument}: task")
-        # The goal is the record's own copy, wherever the record lies now.
-        task = task.model_copy(update={"target": directory / TARGET_FILE})
-        with h5py.File(directory / TARGET_FILE, "r") as file:
-            target = read_tensor(file, "position")
-        stages = tuple(read_stage(path) for path in stage_files(directory))
-        metrics = _read_metrics(directory / METRICS_FILE)
-    except InputError:
-        raise
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(argument, came=f"a damaged file ({error})", expected="the files of a run record") from error
+    run = _read_run(directory)
+    content = current_task(run["task"], record_format=run.get("format", 1))
+    task = validate(Task, content, source=f"{argument}: task")
+    # The goal is the record's own copy, wherever the record lies now.
+    task = task.model_copy(update={"target": directory / TARGET_FILE})
+    limits = limits or _limits(task)
+    with boundary(argument, expected="the files of a run record"):
+        expected = "the goal of a run record"
+        with open_arrays(directory / TARGET_FILE, argument=f"{argument}: {TARGET_FILE}", expected=expected, limits=limits) as file:
+            target = torch.from_numpy(file.read("position", shape=("M", 3), kinds="f", meaning="positions"))
+        scene = task.scene
+        sizes = {"N": scene.particle_count, "M": len(scene.manipulators), "A": scene.action_size}
+        stages = tuple(
+            read_stage(path, argument=f"{argument}: {path.name}", sizes=sizes, limits=limits) for path in stage_files(directory)
+        )
+        metrics = tuple(read_json_lines(directory / METRICS_FILE, argument=f"{argument}: {METRICS_FILE}", limits=limits))
     return RunRecord(directory, run, task, target, metrics, stages)
+
+
+def _limits(task: Task) -> ReadingLimits:
+    """The default limits, raised to what a stage of the task takes: two states, and positions at all times."""
+    limits = default_limits()
+    particles = task.scene.particle_count * (3 * (task.rollout_steps + 1) + 2 * 21 + 1)
+    return dataclasses.replace(limits, array_bytes=max(limits.array_bytes, min(16 * particles, MOST_BYTES)))
 
 
 def _read_run(directory: Path) -> dict[str, Any]:
     path = directory / RUN_FILE
     try:
-        run = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError) as error:
+        missing = not path.exists()
+    except (OSError, ValueError):
+        missing = True
+    if missing:
         expected = "a directory that a run was written to"
-        raise InputError(f"run record {directory}", came=f"no {RUN_FILE}", expected=expected) from error
-    except (OSError, ValueError) as error:
-        raise InputError(str(path), came=f"unreadable content ({error})", expected="JSON") from error
+        raise InputError(f"run record {directory}", came=f"no {RUN_FILE}", expected=expected)
+    run = read_json(path, argument=str(path))
     if not isinstance(run, dict) or "task" not in run or "status" not in run:
         raise InputError(str(path), came="something else", expected="the content of a run record")
+    validate(RunFields, run, source=str(path))
     return run
 
 
-def _read_metrics(path: Path) -> tuple[dict[str, Any], ...]:
-    """Read all lines but a last one that was cut off when the run was killed."""
-    lines = path.read_text(encoding="utf-8").split("\n")
-    return tuple(json.loads(line) for line in lines[:-1])
+class RunFields(BaseModel):
+    """What the fields of ``run.json`` hold, as far as other parts of the package use them."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    status: str
+    advice: str = ""
+    names: dict[str, str] = Field(default_factory=dict)
+    seed: int = Field(default=0, ge=0, le=MOST_SEED)
+    stages_finished: int = Field(default=0, ge=0)
+    resumed_from: dict[str, Any] | None = None
+    recorded_at: str | None = None
+    configuration: dict[str, Any] | None = None
+    task: dict[str, Any]
+    loss_initial: float | None = None
+    loss_final: float | None = None
+    metric: str | None = None
+    metric_initial: float | None = None
+    metric_value: float | None = None
+    seconds: float | None = None

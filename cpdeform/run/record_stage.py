@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import h5py
 import torch
 from torch import Tensor
 
+from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate, Proposal
+from cpdeform.core.reading.arrays import ArrayFile, open_arrays
+from cpdeform.core.reading.arrays_hdf5 import has_attribute, read_attribute, read_texts
+from cpdeform.core.reading.json_text import parse_json
+from cpdeform.core.reading.limits import ReadingLimits
 from cpdeform.core.state import State
 from cpdeform.planning.result import StageResult, Status
-from cpdeform.run.record_files import read_tensor, replacing, to_json, write_dataset
+from cpdeform.run.record_files import replacing, to_json, write_dataset
+
+MARGIN = 1e-3
+"""How far outside of the domain a recorded position may lie for its rounding, length units."""
 
 LENGTH = "length (domain edge = 1)"
 POSE_UNITS = "position: length (domain edge = 1); unit quaternion wxyz: 1; gap: length"
@@ -77,48 +85,106 @@ def _write_candidates(group: h5py.Group, candidates: tuple[Candidate, ...]) -> N
     labels.attrs["shape"], labels.attrs["units"] = "candidate", "text"
 
 
-def read_stage(path: Path) -> StageResult:
+def read_stage(
+    path: Path, *, argument: str | None = None, sizes: Mapping[str, int] | None = None, limits: ReadingLimits | None = None
+) -> StageResult:
     """Read a stage; its `history` is empty, since ``metrics.jsonl`` holds the iterations.
 
+    Args:
+        path: The file.
+        argument: What it is, for messages; defaults to its path.
+        sizes: Sizes that are known: particles N, tools M, action components A.
+        limits: How large it may be.
+
     Raises:
-        OSError: The file cannot be read.
-        KeyError: A part is missing.
+        InputError: The file cannot be read, or a part is missing or is not what a stage has.
     """
-    with h5py.File(path, "r") as file:
-        best = int(file.attrs["best"])
-        return StageResult(
-            index=int(file.attrs["index"]),
-            status=Status(file.attrs["status"]),
-            state_before=_read_state(file["state_before"]),
-            state=_read_state(file["state"]),
-            priorities=read_tensor(file, "priorities"),
-            candidates=_read_candidates(file["placements"]) if "placements" in file else (),
+    argument = argument or f"stage {path}"
+    with open_arrays(path, argument=argument, expected="a stage of a run record", limits=limits, sizes=sizes) as file:
+        state_before, state = _read_state(file, "state_before"), _read_state(file, "state")
+        candidates = _read_candidates(file) if "placements" in file else ()
+        best = read_attribute(file, "best", int)
+        result = StageResult(
+            index=read_attribute(file, "index", int),
+            status=Status(read_attribute(file, "status", str)),
+            state_before=state_before,
+            state=state,
+            priorities=_tensor(file, "priorities", ("N",), finite=False),
+            candidates=candidates,
             best=None if best < 0 else best,
-            actions=_read_optional(file, "actions"),
-            positions=_read_optional(file, "positions"),
-            manipulator_poses=_read_optional(file, "manipulator_poses"),
-            loss_before=float(file.attrs["loss_before"]),
-            loss=float(file.attrs["loss"]),
-            gradient_evaluations=int(file.attrs["gradient_evaluations"]),
+            actions=_tensor(file, "actions", ("T", "A")) if "actions" in file else None,
+            positions=_positions(file, "positions", ("T + 1", "N", 3)) if "positions" in file else None,
+            manipulator_poses=_tensor(file, "manipulator_poses", ("T + 1", "M", 8)) if "manipulator_poses" in file else None,
+            loss_before=read_attribute(file, "loss_before", float),
+            loss=read_attribute(file, "loss", float),
+            gradient_evaluations=read_attribute(file, "gradient_evaluations", int),
             history=(),
-            seconds=json.loads(file.attrs["seconds"]),
-            rollouts=int(file.attrs.get("rollouts", 0)),
+            seconds=_read_seconds(file),
+            rollouts=read_attribute(file, "rollouts", int) if has_attribute(file, "rollouts") else 0,
         )
+    _check_stage(result, argument)
+    return result
 
 
-def _read_state(group: h5py.Group) -> State:
-    return State(**{field.name: read_tensor(group, field.name) for field in dataclasses.fields(State)})
+def _tensor(file: ArrayFile, name: str, shape: Sequence[int | str], *, kinds: str = "f", finite: bool = True) -> Tensor:
+    return torch.from_numpy(file.read(name, shape=shape, kinds=kinds, finite=finite))
 
 
-def _read_optional(file: h5py.File, name: str) -> Tensor | None:
-    return read_tensor(file, name) if name in file else None
+def _positions(file: ArrayFile, name: str, shape: Sequence[int | str]) -> Tensor:
+    """Read positions; simulators keep clay in the unit cube, and index their grids by where it is."""
+    positions = _tensor(file, name, shape)
+    if positions.numel() and not (float(positions.min()) > -MARGIN and float(positions.max()) < 1.0 + MARGIN):
+        came = f"positions from {float(positions.min()):.4g} to {float(positions.max()):.4g}"
+        raise InputError(f"{file.argument}: {name}", came=came, expected="positions in the domain, from 0 to 1")
+    return positions
 
 
-def _read_candidates(group: h5py.Group) -> tuple[Candidate, ...]:
-    poses, actions = read_tensor(group, "pose"), read_tensor(group, "actions")
-    labels = group["label"].asstr()[()]
-    rows = zip(poses, actions, group["score"][()], group["loss"][()], group["contact_particle"][()], labels, strict=True)
-    return tuple(
-        Candidate(Proposal(pose, float(score), str(label), None if particle < 0 else int(particle)), float(loss), plan)
-        for pose, plan, score, loss, particle, label in rows
+def _read_state(file: ArrayFile, name: str) -> State:
+    return State(
+        position=_positions(file, f"{name}/position", (1, "N", 3)),
+        velocity=_tensor(file, f"{name}/velocity", (1, "N", 3)),
+        affine=_tensor(file, f"{name}/affine", (1, "N", 3, 3)),
+        elastic_strain=_tensor(file, f"{name}/elastic_strain", (1, "N", 6)),
+        manipulator_pose=_tensor(file, f"{name}/manipulator_pose", (1, "M", 8)),
     )
+
+
+def _read_candidates(file: ArrayFile) -> tuple[Candidate, ...]:
+    poses = _tensor(file, "placements/pose", ("C", "M", 8))
+    actions = _tensor(file, "placements/actions", ("C", "T", "A"))
+    score, loss = (_tensor(file, f"placements/{name}", ("C",), finite=False).tolist() for name in ("score", "loss"))
+    particles = _tensor(file, "placements/contact_particle", ("C",), kinds="iu").tolist()
+    count = file.header("priorities").shape[0]
+    if any(not -1 <= particle < count for particle in particles):
+        argument = f"{file.argument}: placements/contact_particle"
+        raise InputError(argument, came=f"{min(particles)} to {max(particles)}", expected=f"-1 to {count - 1}")
+    labels = read_texts(file, "placements/label", count=len(poses))
+    return tuple(
+        Candidate(Proposal(pose, score, label, None if particle < 0 else particle), loss, plan)
+        for pose, plan, score, loss, particle, label in zip(poses, actions, score, loss, particles, labels, strict=True)
+    )
+
+
+def _read_seconds(file: ArrayFile) -> dict[str, float]:
+    argument = f"{file.argument}: seconds"
+    seconds = parse_json(read_attribute(file, "seconds", str), argument=argument)
+    if not isinstance(seconds, dict) or not all(type(value) in (int, float) for value in seconds.values()):
+        raise InputError(argument, came=type(seconds).__name__, expected="a number of seconds for each part")
+    return seconds
+
+
+def _check_stage(stage: StageResult, argument: str) -> None:
+    """Raise `InputError` where parts of a stage that are right by themselves do not fit together."""
+    if min(stage.index, stage.gradient_evaluations, stage.rollouts) < 0:
+        came = f"index {stage.index}, gradient_evaluations {stage.gradient_evaluations}, rollouts {stage.rollouts}"
+        raise InputError(argument, came=came, expected="numbers of at least 0")
+    if stage.best is not None and stage.best >= len(stage.candidates):
+        raise InputError(f"{argument}: best", came=str(stage.best), expected=f"one of {len(stage.candidates)} candidates")
+    plan = (stage.actions, stage.positions, stage.manipulator_poses)
+    if stage.status is Status.FINISHED and any(part is None for part in plan):
+        raise InputError(
+            argument, came="a finished stage without a plan", expected="actions, positions, manipulator_poses and best"
+        )
+    if stage.actions is not None and stage.positions is not None and len(stage.positions) != len(stage.actions) + 1:
+        came = f"{len(stage.positions)} times for {len(stage.actions)} steps"
+        raise InputError(f"{argument}: positions", came=came, expected="one time more than steps")

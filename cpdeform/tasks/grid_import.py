@@ -11,8 +11,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import time
-import zipfile
-import zlib
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cpdeform.core.bounded import MOST_PARTICLES
 from cpdeform.core.errors import InputError, UnknownNameError
 from cpdeform.core.plugins import Registry, load_registry
+from cpdeform.core.reading.arrays import MOST_NUMBER, NUMBERS, ArrayFile, open_arrays
+from cpdeform.core.reading.limits import ReadingLimits
 from cpdeform.core.scene import Scene
-from cpdeform.core.target import POSITION_SCALE, write_target
+from cpdeform.core.target import POSITION_SCALE, dense_grid, write_target
 from cpdeform.core.task import Task, load_task
 from cpdeform.planning.objectives.mass import mass_grid
 
@@ -49,6 +51,7 @@ _DECONVOLUTIONS = 50
 _ROUNDS = 3
 _ITERATIONS = 60  # of L-BFGS a round; neighbours are looked up anew between rounds
 _REPULSION = 0.02  # in squared particles per node; smaller from round to round
+_LEAST_NEGATIVE, _NEGATIVE_SHARE = 0.05, 0.01  # negative masses up to these shares of the largest and of the sum are rounding
 _REACH = 0.9  # of the mean distance of neighbours: how far repulsion reaches
 
 
@@ -75,12 +78,13 @@ class ImportedGrid:
     seconds: float
 
 
-def read_grids(path: Path) -> dict[str, NDArray[np.float64]]:
+def read_grids(path: Path, *, limits: ReadingLimits | None = None) -> dict[str, NDArray[np.float64]]:
     """Read all node masses of a file.
 
     Args:
         path: A dense ``.npy`` (G, G, G); or an ``.npz`` of dense arrays, or of pairs ``<name>/cells`` (K, 3), node indices, and
             ``<name>/count`` (K,), node masses, on a grid of 64 nodes an axis.
+        limits: How large it may be; defaults to `cpdeform.core.reading.limits.default_limits`.
 
     Returns:
         Node masses (G, G, G) by name, in the file's own mass unit; of a ``.npy``, the file's name without its ending.
@@ -89,39 +93,28 @@ def read_grids(path: Path) -> dict[str, NDArray[np.float64]]:
         InputError: The file is missing or unreadable, or holds no node masses.
     """
     argument = f"grid file {path}"
-    try:
-        with path.open("rb") as file:
-            loaded = np.load(file, allow_pickle=False)
-            arrays = {path.stem: loaded} if isinstance(loaded, np.ndarray) else {key: loaded[key] for key in loaded.files}
-    except FileNotFoundError as error:
-        raise InputError(argument, came="no such file", expected="an .npy or .npz file of node masses") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(argument, came=f"unreadable content ({error})", expected="an .npy or .npz file of numbers") from error
-    grids = {}
-    for key, values in arrays.items():
-        name, _, kind = key.rpartition("/")
-        if kind == "cells" and f"{name}/count" in arrays:
-            grids[name] = _dense(values, arrays[f"{name}/count"], f"{argument}: {name}")
-        elif values.ndim == 3 and values.dtype.kind in "fui":
-            grids[key] = values.astype(np.float64)
+    expected = "an .npy or .npz file of node masses"
+    with open_arrays(path, argument=argument, expected=expected, limits=limits) as file:
+        grids, headers = {}, {key: file.header(key) for key in file.names or (path.stem,)}
+        for key, header in headers.items():
+            name, _, kind = key.rpartition("/")
+            if kind == "cells" and f"{name}/count" in headers:
+                grids[name] = _dense(file, name, f"{argument}: {name}")
+            elif len(header.shape) == 3 and header.dtype.kind in NUMBERS:
+                grids[key] = file.read(key, shape=None, finite=False).astype(np.float64)
     if not grids:
         raise InputError(
             argument,
-            came=", ".join(f"{key} {values.shape}" for key, values in list(arrays.items())[:5]) or "no array",
+            came=", ".join(f"{key} {header.shape}" for key, header in list(headers.items())[:5]) or "no array",
             expected="node masses: a dense array (64, 64, 64), or <name>/cells (K, 3) and <name>/count (K,)",
         )
     return grids
 
 
-def _dense(cells: NDArray[Any], count: NDArray[Any], argument: str, size: int = 64) -> NDArray[np.float64]:
-    if cells.ndim != 2 or cells.shape[1] != 3 or count.shape != cells.shape[:1] or cells.dtype.kind not in "ui":
-        came = f"cells {cells.dtype} {cells.shape}, count {count.shape}"
-        raise InputError(argument, came=came, expected="node indices (K, 3) and masses (K,)")
-    if len(cells) and not 0 <= int(cells.min()) <= int(cells.max()) < size:
-        raise InputError(argument, came=f"node indices up to {int(cells.max())}", expected=f"indices from 0 to {size - 1}")
-    grid = np.zeros((size,) * 3)
-    grid[tuple(cells.astype(np.int64).T)] = count
-    return grid
+def _dense(file: ArrayFile, name: str, argument: str, size: int = 64) -> NDArray[np.float64]:
+    count = file.header(f"{name}/count").shape
+    cells = file.read(f"{name}/cells", shape=(*count, 3), kinds="ui", meaning="node indices")
+    return dense_grid(cells, file.read(f"{name}/count", shape=count[:1], finite=False), size, argument=argument)
 
 
 def choose_grid(grids: dict[str, NDArray[np.float64]], name: str | None, *, path: Path) -> str:
@@ -184,8 +177,8 @@ def import_grid(
     began = time.perf_counter()
     scene = task.scene
     count = scene.particle_count if particles is None else particles
-    if count < 1:
-        raise InputError("--particles", came=str(count), expected="at least 1")
+    if not 1 <= count <= MOST_PARTICLES:
+        raise InputError("--particles", came=str(count), expected=f"at least 1, at most {MOST_PARTICLES}")
     counts = _check_grid(grid, scene, name=name)
     counts *= count / counts.sum()
     positions = fit_particles(counts, scene, count=count, seed=seed)
@@ -262,8 +255,24 @@ def _check_grid(grid: NDArray[Any], scene: Scene, *, name: str) -> NDArray[np.fl
     if grid.shape != shape:
         raise InputError(argument, came=f"shape {grid.shape}", expected=f"{shape}, the grid of the task's scene")
     values = grid.astype(np.float64)
-    if not np.isfinite(values).all() or values.min() < -1e-3 * max(values.max(), 0.0) or not values.max() > 0.0:
-        raise InputError(argument, came="negative, non-finite or no masses", expected="finite masses of at least 0, not all 0")
+    if not (np.abs(values) <= MOST_NUMBER).all() or not values.max() > 0.0:
+        raise InputError(
+            argument, came="negative, non-finite, huge or no masses", expected="finite masses of at least 0, not all 0"
+        )
+    lowest, highest = float(values.min()), float(values.max())
+    negative, total = -float(values[values < 0.0].sum()), float(values[values > 0.0].sum())
+    if -lowest >= _LEAST_NEGATIVE * highest or negative >= _NEGATIVE_SHARE * total:
+        came = f"negative masses (down to {lowest:.3g} beside {highest:.3g}, {negative / total:.2g} of the total)"
+        expected = (
+            f"masses of at least 0, but for rounding (below {_LEAST_NEGATIVE:.0%} of the largest, {_NEGATIVE_SHARE:.0%} of all)"
+        )
+        raise InputError(argument, came=came, expected=expected)
+    if lowest < 0.0:
+        count = int((values < 0.0).sum())
+        warnings.warn(
+            f"{argument}: {count} negative masses, {negative / total:.2g} of the total, are taken for rounding and count as 0.",
+            stacklevel=3,
+        )
     return np.maximum(values, 0.0)
 
 

@@ -9,7 +9,7 @@ the scene (as JSON) and target_grid (G, G, G), too, and have any name.
 from __future__ import annotations
 
 import dataclasses
-import json
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,9 +21,15 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from torch import Tensor
 
-from cpdeform.core.errors import CapabilityError, InputError
+from cpdeform.core.bounded import MOST_STEPS
+from cpdeform.core.errors import CapabilityError, InputError, brief
+from cpdeform.core.reading.arrays import NUMBERS, ArrayFile, open_arrays
+from cpdeform.core.reading.json_text import parse_json, read_json
+from cpdeform.core.reading.limits import ReadingLimits
+from cpdeform.core.reading.models import field_error
 from cpdeform.core.scene import Scene
 from cpdeform.core.state import State, elastic_strain_from_gradient
+from cpdeform.core.target import dense_grid
 
 NAME_PATTERN = re.compile(r"(?P<scene>.+?)-(?P<version>v\d+)(?:[-.].*)?$")
 SCENES: Mapping[str, tuple[str, str]] = {
@@ -84,35 +90,36 @@ def golden_files(directory: Path) -> list[Path]:
     return found
 
 
-def read_golden(path: Path, *, scenes: Path | None = None, targets: Path | None = None) -> Golden:
+def read_golden(
+    path: Path, *, scenes: Path | None = None, targets: Path | None = None, limits: ReadingLimits | None = None
+) -> Golden:
     """Read a golden file.
 
     Args:
         path: The file.
         scenes: JSON file of scene definitions; ``plasticinelab/scenes.json`` beside the file's folder where absent.
         targets: Target grids; ``plasticinelab/target_grids.npz`` beside the file's folder where absent, if it exists.
+        limits: How large the file may be; defaults to `cpdeform.core.reading.limits.default_limits`.
 
     Raises:
-        InputError: A file is missing, or its content does not fit.
+        InputError: A file is missing or too large, or its content does not fit.
         CapabilityError: The scene holds a manipulator that this version does not know.
     """
-    try:
-        with np.load(path) as file:
-            own = str(file["scene"]) if "scene" in file else None
-            arrays = {key: file[key].astype(np.float64) for key in file if key != "scene"}
-        if own is not None:
-            scene = _validated(json.loads(own), path, "scene")
-            grid = torch.as_tensor(arrays["target_grid"]) if "target_grid" in arrays else None
+    with open_arrays(path, argument=str(path), expected="a golden file", limits=limits) as file:
+        if "scene" in file:
+            text = str(file.read("scene", shape=(), kinds="U", meaning="a scene as JSON"))
+            scene = _scene(f"{path}: scene", _own_definition(path, text), file)
+            arrays = _read_arrays(file, scene)
+            shape = (scene.grid_size,) * 3
+            grid = torch.as_tensor(file.read("target_grid", shape=shape)) if "target_grid" in file else None
         else:
             scene_name, grid_name = _names(path)
-            beside = path.resolve().parent.parent / "plasticinelab"
-            scene = _scene(scenes or beside / "scenes.json", scene_name, arrays)
+            beside = Path(os.path.realpath(path)).parent.parent / "plasticinelab"
+            definition = _definition(scenes or beside / "scenes.json", scene_name)
+            scene = _scene(f"{scenes or beside / 'scenes.json'}: {scene_name}", definition, file)
+            arrays = _read_arrays(file, scene)
             grid = _target_grid(targets, beside / "target_grids.npz", grid_name, scene)
-        return Golden(path.stem, scene, recorded_start(scene, arrays), arrays, grid)
-    except OSError as error:
-        raise InputError(str(path), came=f"{error}", expected="a golden file with its scene definition") from error
-    except KeyError as error:
-        raise InputError(str(path), came=f"no array {error}", expected="x0, v0, F0, C0, prim, actions, x and v") from error
+    return Golden(path.stem, scene, recorded_start(scene, arrays), arrays, grid)
 
 
 def _names(path: Path) -> tuple[str, str]:
@@ -124,29 +131,60 @@ def _names(path: Path) -> tuple[str, str]:
     return scene, f"{grid}-{match['version']}"
 
 
-def _scene(path: Path, name: str, arrays: dict[str, NDArray[np.float64]]) -> Scene:
-    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    if name not in content:
-        raise InputError(str(path), came=f'no scene "{name}"', expected=f"one of {', '.join(content)}")
-    fields = {key: value for key, value in content[name].items() if key != "variants"}
-    recorded = {
-        "softness": ("softness", float),
-        "substeps": ("substeps", int),
-        "dt": ("time_step", float),
-        "n_grid": ("grid_size", int),
-    }
-    fields |= {field: kind(arrays[key]) for key, (field, kind) in recorded.items() if key in arrays}
-    return _validated(fields, path, name)
+def _own_definition(path: Path, text: str) -> dict[str, Any]:
+    """Fields of the scene that a golden file holds itself."""
+    content = parse_json(text, argument=f"{path}: scene")
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: scene", came=type(content).__name__, expected="the fields of a scene")
+    return content
 
 
-def _validated(fields: dict[str, Any], path: Path, name: str) -> Scene:
+def _definition(path: Path, name: str) -> dict[str, Any]:
+    """Fields of a scene, as they are defined."""
+    content = read_json(path, argument=str(path))
+    if not isinstance(content, dict) or not isinstance(content.get(name), dict):
+        known = ", ".join(content) if isinstance(content, dict) else "definitions of scenes by name"
+        raise InputError(str(path), came=f'no scene "{name}"', expected=f"one of {known}")
+    return {key: value for key, value in content[name].items() if key != "variants"}
+
+
+def _scene(source: str, fields: dict[str, Any], file: ArrayFile) -> Scene:
+    """The scene with what the recording says about its discretisation."""
+    recorded = {"softness": "softness", "substeps": "substeps", "dt": "time_step", "n_grid": "grid_size"}
+    fields = fields | {field: file.read(key, shape=()).item() for key, field in recorded.items() if key in file}
     try:
         return Scene.model_validate(fields)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        if first["type"] == "union_tag_invalid":
-            raise CapabilityError(f"this version has no such manipulator: {first['msg']}") from error
-        raise InputError(f"{path}: {name}", came=f"{first['loc']}: {first['msg']}", expected="a scene") from error
+        if first["type"] == "union_tag_invalid" and first["loc"][0] == "manipulators":
+            raise CapabilityError(brief(f"this version has no such manipulator: {first['msg']}", 300)) from error
+        raise field_error(Scene, error, source=source) from error
+
+
+def _read_arrays(file: ArrayFile, scene: Scene) -> dict[str, NDArray[np.float64]]:
+    """All arrays of numbers; those that are used have the scene's shapes."""
+    count, tools = scene.particle_count, sum(8 if hasattr(tool, "gap") else 7 for tool in scene.manipulators)
+    shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys(("x0", "v0", "x", "v"), (count, 3))
+    shapes |= {"F0": (count, 3, 3), "C0": (count, 3, 3)}
+    shapes |= {"actions": ("T", scene.action_size), "prim": ("T + 1", tools)}
+    for name in shapes:
+        if name not in file:
+            expected = "x0, v0, F0, C0, prim, actions, x and v"
+            raise InputError(file.argument, came=f'no array "{name}"', expected=expected)
+    arrays = {name: file.read(name, shape=shape) for name, shape in shapes.items()}
+    steps, times = len(arrays["actions"]), len(arrays["prim"])
+    if not 1 <= steps <= MOST_STEPS or times != steps + 1:
+        raise InputError(file.argument, came=f"{times} tool states for {steps} actions", expected="one more, at least 1 action")
+    if float(np.abs(arrays["actions"]).max(initial=0.0)) > 1.0 + 1e-6:
+        raise InputError(f"{file.argument}: actions", came="actions above 1", expected="actions in [-1, 1]")
+    if min(arrays["x0"].min(), arrays["x"].min()) < 0.0 or max(arrays["x0"].max(), arrays["x"].max()) > 1.0:
+        raise InputError(f"{file.argument}: x0, x", came="positions outside of the domain", expected="positions from 0 to 1")
+    # Gradients that overflowed and losses that were not computed are recorded, too.
+    others: dict[str, tuple[int | str, ...]] = {"total_loss": (), "grad": ("T", scene.action_size)}
+    arrays |= {name: file.read(name, shape=shape, finite=False) for name, shape in others.items() if name in file}
+    rest = {name: file.header(name) for name in file.names if name not in arrays}
+    arrays |= {name: file.read(name, shape=None, finite=False) for name, header in rest.items() if header.dtype.kind in NUMBERS}
+    return {name: values.astype(np.float64) for name, values in arrays.items()}
 
 
 def recorded_poses(scene: Scene, recorded: NDArray[np.float64]) -> Tensor:
@@ -173,10 +211,12 @@ def recorded_start(scene: Scene, arrays: dict[str, NDArray[np.float64]]) -> Stat
 def _target_grid(given: Path | None, beside: Path, name: str, scene: Scene) -> Tensor | None:
     if given is None and not beside.is_file():
         return None
-    with np.load(given or beside) as file:
+    path = given or beside
+    argument = f"{path}: {name}"
+    with open_arrays(path, argument=str(path), expected="an .npz file of target grids") as file:
         if f"{name}/cells" not in file:
             return None
-        cells, count = file[f"{name}/cells"], file[f"{name}/count"]
-    grid = torch.zeros((scene.grid_size,) * 3, dtype=torch.float64)
-    grid[tuple(torch.as_tensor(cells.astype(np.int64)).T)] = torch.as_tensor(count.astype(np.float64)) * scene.particle_volume
-    return grid
+        cells = file.read(f"{name}/cells", shape=("K", 3), kinds="ui", meaning="node indices")
+        count = file.read(f"{name}/count", shape=("K",), meaning="masses")
+    grid = dense_grid(cells, count.astype(np.float64), scene.grid_size, argument=argument)
+    return torch.as_tensor(grid) * scene.particle_volume

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import re
 import sys
 import types
 
@@ -70,13 +71,104 @@ def test_broken_plugins_are_reported_and_the_others_work(monkeypatch):
         registry.find("placer", "godo")
 
 
-def test_duplicates_name_both(monkeypatch):
+def test_of_two_parts_of_a_name_the_first_stays_and_the_other_is_listed(monkeypatch):
     points = [
         plugin(monkeypatch, name, cpdeform_placers=lambda target=f"{name}:x": [PluginSpec("same", target, "")])
-        for name in ("a", "b")
+        for name in ("b", "a")
     ]
-    with pytest.raises(PluginError, match=r'placer "same" is registered twice: .*a:x.*b:x'):
-        load_registry(points)
+    for order in (points, points[::-1]):
+        registry = load_registry(order)
+        assert registry.find("placer", "same").spec.target == "a:x"
+        (failure,) = registry.failures
+        assert failure.entry_point == "b"
+        assert re.search(r'placer "same" \(b:x\) is registered already, by .*\(a:x\)', failure.reason)
+
+
+def test_no_plugin_takes_the_place_of_a_built_in_part(monkeypatch):
+    mine = plugin(monkeypatch, "aaa", cpdeform_simulators=lambda: [PluginSpec("warp", "json:loads", "")])
+    registry = load_registry([mine, *importlib.metadata.entry_points(group="cpdeform")])
+    assert registry.find("simulator", "warp").spec.target.startswith("cpdeform.")
+    assert [failure.entry_point for failure in registry.failures] == ["aaa"]
+
+
+class Bare(BaseException):
+    """Neither an error nor an exit."""
+
+
+def raising(error):
+    def factory(**options):
+        raise error
+
+    return factory
+
+
+@pytest.mark.parametrize(
+    ("returned", "reason"),
+    [
+        (None, "must return a list"),
+        (5, "must return a list"),
+        ([PluginSpec(None, "a:b", "")], "name must be a text"),
+        ([PluginSpec(" ", "a:b", "")], "must have a name"),
+        ([PluginSpec("x", "a", "")], "target"),
+        ([PluginSpec("x", 3, "")], "target must be a text"),
+        ([PluginSpec("x", "a:b", None)], "summary must be a text"),
+        ([PluginSpec("x", "a:b", "", automatic={"cpu": "high"})], "ranks by device"),
+        ([PluginSpec("x", "a:b", "", automatic=3)], "ranks by device"),
+    ],
+)
+def test_a_part_of_the_wrong_form_is_listed_and_the_others_of_its_plugin_work(monkeypatch, returned, reason):
+    good = [PluginSpec("good", "json:dumps", "")]
+    beside = [*good, *returned] if isinstance(returned, list) else returned
+    found = load_registry([plugin(monkeypatch, "a", cpdeform_simulators=lambda: beside, cpdeform_placers=lambda: good)])
+    (failure,) = found.failures
+    assert reason in failure.reason
+    assert found.names("placer") == ["good"]
+    assert found.names("simulator") == (["good"] if isinstance(returned, list) else [])
+
+
+@pytest.mark.parametrize("error", [SystemExit(0), SystemExit("bye"), Bare("odd"), RuntimeError("x" * 5000), GeneratorExit()])
+def test_what_a_plugin_raises_stays_with_it(monkeypatch, error):
+    module = types.ModuleType("made_parts")
+    module.make, module.nothing, module.number = raising(error), lambda: None, 3
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    parts = [PluginSpec(name, f"made_parts:{name}", "", automatic={"cpu": 9}) for name in ("make", "nothing", "number")]
+    points = [plugin(monkeypatch, "a", cpdeform_tasks=raising(error), cpdeform_placers=lambda: parts)]
+    registry = load_registry(points)
+    (failure,) = registry.failures
+    assert type(error).__name__ in failure.reason
+    assert len(failure.reason) <= 300
+    for name, reason in (("make", type(error).__name__), ("nothing", "made nothing"), ("number", "cannot be called")):
+        with pytest.raises(PluginError, match=reason):
+            registry.create("placer", name)
+
+
+def test_auto_passes_over_a_part_that_exits_when_it_is_imported(monkeypatch, tmp_path, capsys):
+    (tmp_path / "made_exiting.py").write_text("print('hello')\nimport sys\nsys.exit(0)\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    specs = [
+        PluginSpec("exits", "made_exiting:x", "", automatic={"cpu": 9}),
+        PluginSpec("works", "json:loads", "", automatic={"cpu": 1}),
+    ]
+    registry = load_registry([plugin(monkeypatch, "a", cpdeform_simulators=lambda: specs)])
+    assert registry.resolve("simulator", "auto", device="cpu") == "works"
+    assert set(registry.installed("simulator")) == {"works"}
+    with pytest.raises(PluginError, match=r"called sys\.exit\(0\)"):
+        registry.load("simulator", "exits")
+    written = capsys.readouterr()
+    assert "hello" in written.err
+    assert not written.out
+
+
+def test_an_interruption_passes(monkeypatch):
+    with pytest.raises(KeyboardInterrupt):
+        load_registry([plugin(monkeypatch, "a", cpdeform_tasks=raising(KeyboardInterrupt()))])
+    module = types.ModuleType("made_interrupted")
+    module.make = raising(KeyboardInterrupt())
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    spec = PluginSpec("x", "made_interrupted:make", "")
+    registry = load_registry([plugin(monkeypatch, "b", cpdeform_placers=lambda: [spec])])
+    with pytest.raises(KeyboardInterrupt):
+        registry.create("placer", "x")
 
 
 def test_unknown_name_suggests_the_nearest(toy_entry_points):

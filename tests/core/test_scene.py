@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -38,7 +39,7 @@ def test_derived_numbers():
     [
         ({"bodies": ()}, "at least 1 item"),
         ({"bodies": ({**BALL, "position": (0.95, 0.5, 0.5)},)}, "along x, expected one inside the domain"),
-        ({"bodies": ({**BALL, "radius": 0.0},)}, "greater than 0"),
+        ({"bodies": ({**BALL, "radius": 0.0},)}, "greater than"),
         ({"bodies": ({**BALL, "particle_count": 0},)}, "greater than 0"),
         ({"bodies": ({**BALL, "kind": "cone"},)}, "tag 'cone'"),
         ({"bodies": ({**BALL, "colour": "red"},)}, "not permitted"),
@@ -49,9 +50,19 @@ def test_derived_numbers():
         ({"manipulators": ({**PEN, "friction": math.inf},)}, "finite number"),
         ({"manipulators": ({**PEN, "kind": "Hammer"},)}, "Hammer"),
         ({"grid_size": 4}, "greater than or equal to 8"),
-        ({"time_step": 0.0}, "greater than 0"),
-        ({"time_step": math.nan}, "finite number|greater than 0"),
+        ({"time_step": 0.0}, "greater than"),
+        ({"time_step": math.nan}, "finite number"),
         ({"substeps": 0}, "greater than or equal to 1"),
+        ({"time_step": True}, "valid number"),
+        ({"time_step": "5"}, "valid number"),
+        ({"substeps": True}, "valid integer"),
+        ({"substeps": 1.5}, "valid integer"),
+        ({"substeps": 10**19}, "less than or equal to"),
+        ({"time_step": 10**400}, "finite number"),
+        ({"bodies": ({**BALL, "particle_count": 2e9},)}, "less than or equal to"),
+        ({"bodies": ({**BALL, "particle_count": 9_000_000},) * 2}, "18000000 particles of all bodies"),
+        ({"bodies": ({**BALL, "position": ("0.5", 0.5, 0.5)},)}, "valid number"),
+        ({"manipulators": ({**PEN, "position": (1e300, 0.5, 0.5)},)}, "less than or equal to"),
         ({"material": {"poisson_ratio": 0.5}}, "less than 0.5"),
     ],
 )
@@ -74,3 +85,10 @@ def test_initial_state():
     assert not state.velocity.any()
     assert not state.elastic_strain.any()
     assert state.manipulator_pose[1, 0].tolist() == pytest.approx([0.1, 0.2, 0.3, 0.6, 0.0, 0.8, 0.0, 0.0])
+
+
+def test_a_number_without_a_fraction_is_a_whole_number():
+    scene = Scene(bodies=({**BALL, "particle_count": 1e3},), substeps=np.int64(7), time_step=np.float32(0.5))
+    assert (scene.bodies[0].particle_count, scene.substeps, scene.time_step) == (1000, 7, 0.5)
+    assert type(scene.bodies[0].particle_count) is int
+    assert Scene.model_validate_json(scene.model_dump_json()) == scene

@@ -5,7 +5,8 @@ import pytest
 import yaml
 
 from cpdeform.core.errors import InputError, PluginError, UnknownNameError
-from cpdeform.core.plugins import load_registry
+from cpdeform.core.plugins import load_registry, split_options
+from cpdeform.core.target import load_target_grid
 from cpdeform.core.task import Task, list_variants, load_target, load_task, merge, read_task, validate
 from cpdeform.run.configuration import RunConfiguration
 
@@ -136,3 +137,70 @@ def test_validate_names_field_and_flag_values():
 def test_configuration_round_trip():
     configuration = validate(RunConfiguration, yaml.safe_load("{task: a, optimizer: {iterations: 3}}"), source="x")
     assert RunConfiguration.model_validate_json(configuration.model_dump_json()) == configuration
+
+
+def test_one_rule_for_numbers_in_files_and_options(make_toy_task, tmp_path):
+    path = make_toy_task()
+    path.write_text(path.read_text().replace("particle_count: 60", "particle_count: 6e1"))
+    assert load_task(path).scene.particle_count == 60
+    options = split_options(["optimizer.iterations=1e1", "scene.time_step=1"])
+    assert validate(RunConfiguration, options, source="x").optimizer.iterations == 10
+    for value, message in (("true", "valid number"), ("'5'", "valid number"), ("1e308", "less than or equal")):
+        path.write_text(make_toy_task().read_text().replace("scene:\n", f"scene:\n  time_step: {value}\n"))
+        with pytest.raises(InputError, match=rf"scene\.time_step: got .*{message}"):
+            load_task(path)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    ["optimizer.iterations=true", "optimizer.iterations='5'", "seed=1e19", "steps=1e8", "rest_steps=1e9", "stages=1.5", "seed=-1"],
+)
+def test_options_that_are_no_such_number(setting):
+    with pytest.raises(InputError, match=setting.partition("=")[0]):
+        validate(RunConfiguration, split_options([setting]), source="--set")
+
+
+def test_a_misspelt_field_comes_before_what_it_left_missing():
+    body = {"kind": "box", "position": [0.5, 0.5, 0.5], "width": [0.1, 0.1, 0.1]}
+    with pytest.raises(UnknownNameError, match='Did you mean "widths"'):
+        validate(Task, {"scene": {"bodies": [body]}}, source="x")
+    with pytest.raises(UnknownNameError, match='Did you mean "learning_rate"'):
+        validate(RunConfiguration, {"optimizer": {"lr": 0.1}, "seed": -1}, source="x")
+
+
+def test_digits_of_other_scripts_are_no_index():
+    for index in ("²", "٣", "9" * 5000):
+        with pytest.raises(InputError, match="an index from 0 to 1"):
+            merge({"bodies": [1, 2]}, {"bodies": {index: 3}})
+
+
+@pytest.mark.parametrize("name", ["../x", "a/b", "a\\b", "", "x" * 200, "a\nb"])
+def test_a_tasks_name_is_no_path(make_toy_task, name):
+    with pytest.raises(InputError, match="name"):
+        load_task(make_toy_task(name=name))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"grid_cells": [[0, -1, 0]], "grid_mass": [1.0]}, "a node index -1, expected indices from 0 to 63"),
+        ({"grid_cells": [[0, 0, 64]], "grid_mass": [1.0]}, "a node index 64"),
+        ({"grid_cells": [[0, 0, 1], [0, 0, 1]], "grid_mass": [1.0, 2.0]}, "1 nodes more than once"),
+        ({"grid_cells": [[0, 0, 1]], "grid_mass": [1j]}, "grid_mass: got complex128"),
+        ({"grid_cells": [[0, 0, 1]], "grid_mass": [1e308]}, "grid_mass: got 1 values that are nan, infinite or huge"),
+        ({"grid_cells": [[0, 0, 1]], "grid_mass": [-1.0]}, "negative masses"),
+        ({"grid_cells": [[0, 0, 1]], "grid_mass": [1.0, 2.0]}, r"grid_mass: got float64 of shape \(2,\)"),
+        ({"grid_cells": [[0.0, 0.0, 1.0]], "grid_mass": [1.0]}, "grid_cells: got float64"),
+    ],
+)
+def test_bad_grids_of_targets(tmp_path, toy_task_file, arrays, message):
+    np.savez(tmp_path / "bad.npz", position=np.full((4, 3), 0.5), **{name: np.array(values) for name, values in arrays.items()})
+    with pytest.raises(InputError, match=message):
+        load_target_grid(tmp_path / "bad.npz", scene=load_task(toy_task_file).scene)
+
+
+def test_another_format_as_goal_is_called_that(tmp_path, toy_task_file):
+    (tmp_path / "goal.ply").write_text("ply\nformat ascii 1.0\n")
+    with pytest.raises(InputError, match=r"it begins with .*ply.*expected an \.npz, \.npy or \.h5 file") as caught:
+        load_target(tmp_path / "goal.ply", scene=load_task(toy_task_file).scene)
+    assert "pickle" not in str(caught.value)

@@ -222,6 +222,56 @@ def test_damaged_records(tmp_path, run):
         load_record(directory)
 
 
+def fill(name, number):
+    def change(file):
+        values = file[name][()]
+        values[...] = number
+        del file[name]
+        file[name] = values
+
+    return change
+
+
+def replace_group(file):
+    del file["state"]
+    file["state"] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (fill("state/position", float("nan")), r"stage-000\.h5: state/position: got 180 values that are nan"),
+        (fill("state_before/velocity", float("nan")), r"state_before/velocity: got 180 values"),
+        (fill("manipulator_poses", float("nan")), r"stage-000\.h5: manipulator_poses: got 48 values"),
+        (fill("state/position", 7.0), r"state/position: got positions from 7 to 7, expected positions in the domain"),
+        (fill("placements/contact_particle", 60), "contact_particle: got 60 to 60, expected -1 to 59"),
+        (replace_group, "state/position: got|no array of that name"),
+        (lambda file: file.attrs.__setitem__("best", 3), r"best: got 3, expected one of 3 candidates"),
+        (lambda file: file.attrs.__setitem__("index", 1.5), "index: got"),
+        (lambda file: file.attrs.__setitem__("seconds", "[1]"), "seconds: got list"),
+        (lambda file: file.__delitem__("actions"), "a finished stage without a plan"),
+    ],
+)
+def test_a_damaged_stage_is_named(tmp_path, run, change, message):
+    directory = run(stages=1).save(tmp_path / "run")
+    with h5py.File(directory / "stage-000.h5", "a") as file:
+        change(file)
+    with pytest.raises(InputError, match=message) as caught:
+        load_record(directory)
+    assert str(caught.value).startswith("run record ")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("names", "warp"), ("seed", -1), ("seed", 2**70), ("status", 5), ("metric_value", "x")]
+)
+def test_fields_of_the_run_that_are_something_else(tmp_path, run, field, value):
+    directory = run(stages=1).save(tmp_path / "run")
+    content = json.loads((directory / "run.json").read_text())
+    (directory / "run.json").write_text(json.dumps({**content, field: value}))
+    with pytest.raises(InputError, match=rf"run\.json: {field}"):
+        load_record(directory)
+
+
 def test_temporary_files_belong_to_the_record(tmp_path):
     names = [".run.tmp.json", ".stage-003.tmp.h5", ".animation.tmp.mp4", "stage-1000.h5", "picture.png"]
     for name in [*names, "stage-x.h5", ".hidden", "run.json.bak"]:

@@ -7,6 +7,7 @@ import abc
 import numpy as np
 from pydantic import Field
 
+from cpdeform.core.bounded import MOST_PARTICLES, Whole
 from cpdeform.core.material import Material
 from cpdeform.core.model import FrozenModel, Vector3
 from cpdeform.core.shapes.base import Array, RandomNumbers, Shape
@@ -22,7 +23,7 @@ class BodyBase(FrozenModel, abc.ABC):
     """
 
     position: Vector3
-    particle_count: int = Field(default=10000, gt=0)
+    particle_count: Whole = Field(default=10000, gt=0, le=MOST_PARTICLES)
     material: Material | None = None
 
     @abc.abstractmethod

@@ -6,8 +6,10 @@ import dataclasses
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from pydantic import Field
 
-from cpdeform.core.model import NonNegativeFloat, PositiveFloat, Vector3
+from cpdeform.core.bounded import Coordinate, Lengths3
+from cpdeform.core.model import Vector3
 from cpdeform.core.shapes.base import Array, RandomNumbers, Shape
 from cpdeform.core.shapes.body import BodyBase
 from cpdeform.core.shapes.lengths import corner_distance
@@ -88,8 +90,8 @@ class ManipulatorBox(ManipulatorBase):
     """A block of `half_extents` (3,), grown by `rounding` on all sides, length units."""
 
     kind: Literal["Box"] = "Box"
-    half_extents: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
-    rounding: NonNegativeFloat = 0.0
+    half_extents: Lengths3
+    rounding: Coordinate = Field(default=0.0, ge=0.0)
 
     def shape(self, *, gap: Tensor | float | None = None) -> ShapeBox:
         """See `ManipulatorBase`."""
@@ -110,7 +112,7 @@ class BodyBox(BodyBase):
     """An axis-aligned block of clay. Attributes: widths (3,), full edges, length units; see `BodyBase` for the others."""
 
     kind: Literal["box"] = "box"
-    widths: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+    widths: Lengths3
 
     def shape(self) -> ShapeBox:
         """See `BodyBase`."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
-from cpdeform.core.model import PositiveFloat
+from cpdeform.core.bounded import Length
 from cpdeform.core.shapes.base import Array, Shape
 from cpdeform.core.shapes.lengths import segment_distance
 from cpdeform.core.shapes.manipulator import ManipulatorBase
@@ -76,9 +76,9 @@ class ManipulatorChopsticks(ManipulatorBase):
     """
 
     kind: Literal["Chopsticks"] = "Chopsticks"
-    radius: PositiveFloat
-    height: PositiveFloat
-    gap: PositiveFloat = 0.06
+    radius: Length
+    height: Length
+    gap: Length = 0.06
     action_meanings: ClassVar[Mapping[int, str]] = MappingProxyType(
         {0: "fixed", 7: "translation, rotation in the tool's own frame, closing of the gap"}
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from cpdeform.core.model import PositiveFloat
+from cpdeform.core.bounded import Length
 from cpdeform.core.shapes.base import Array, Shape
 from cpdeform.core.shapes.lengths import along_and_across, corner_distance, length
 from cpdeform.core.shapes.manipulator import ManipulatorBase
@@ -49,8 +49,8 @@ class ManipulatorCylinder(ManipulatorBase):
     """A solid cylinder about the local y axis: `radius` and `half_height`, length units."""
 
     kind: Literal["Cylinder"] = "Cylinder"
-    radius: PositiveFloat
-    half_height: PositiveFloat
+    radius: Length
+    half_height: Length
 
     def shape(self, *, gap: Tensor | float | None = None) -> ShapeCylinder:
         """See `ManipulatorBase`."""

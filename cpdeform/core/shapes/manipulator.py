@@ -5,10 +5,11 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
+from cpdeform.core.bounded import Real
 from cpdeform.core.errors import InputError
 from cpdeform.core.model import FrozenModel, NonNegativeFloat, Quaternion, Vector3
 from cpdeform.core.shapes.base import Shape
@@ -33,7 +34,7 @@ class ManipulatorBase(FrozenModel, abc.ABC):
     position: Vector3
     rotation_wxyz: Quaternion = (1.0, 0.0, 0.0, 0.0)
     friction: NonNegativeFloat = 0.9
-    action_scale: tuple[NonNegativeFloat, ...] = ()
+    action_scale: tuple[Annotated[Real, Field(ge=0.0, le=1000.0)], ...] = ()
     lower_bound: Vector3 = (0.0, 0.0, 0.0)
     upper_bound: Vector3 = (1.0, 1.0, 1.0)
 

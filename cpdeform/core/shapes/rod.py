@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
-from cpdeform.core.model import PositiveFloat
+from cpdeform.core.bounded import Length
 from cpdeform.core.shapes.base import Array, Shape
 from cpdeform.core.shapes.lengths import along_and_across, segment_distance
 from cpdeform.core.shapes.manipulator import ManipulatorBase
@@ -48,8 +48,8 @@ class ShapeRod(Shape):
 class ManipulatorRod(ManipulatorBase):
     """All points within `radius` of the segment y in [-height/2, height/2] of the local frame, length units."""
 
-    radius: PositiveFloat
-    height: PositiveFloat
+    radius: Length
+    height: Length
 
     def shape(self, *, gap: Tensor | float | None = None) -> ShapeRod:
         """See `ManipulatorBase`."""

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from cpdeform.core.model import PositiveFloat, Vector3
+from cpdeform.core.bounded import Length
+from cpdeform.core.model import Vector3
 from cpdeform.core.shapes.base import Array, RandomNumbers, Shape
 from cpdeform.core.shapes.body import BodyBase
 from cpdeform.core.shapes.lengths import length
@@ -54,7 +55,7 @@ class ManipulatorSphere(ManipulatorBase):
     """A ball. Attributes: radius, length units."""
 
     kind: Literal["Sphere"] = "Sphere"
-    radius: PositiveFloat
+    radius: Length
 
     def shape(self, *, gap: Tensor | float | None = None) -> ShapeSphere:
         """See `ManipulatorBase`."""
@@ -70,7 +71,7 @@ class BodySphere(BodyBase):
     """A ball of clay. Attributes: radius, length units; see `BodyBase` for the others."""
 
     kind: Literal["sphere"] = "sphere"
-    radius: PositiveFloat
+    radius: Length
 
     def shape(self) -> ShapeSphere:
         """See `BodyBase`."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from cpdeform.core.model import PositiveFloat
+from cpdeform.core.bounded import Length
 from cpdeform.core.shapes.base import Array, Shape
 from cpdeform.core.shapes.lengths import along_and_across, length
 from cpdeform.core.shapes.manipulator import ManipulatorBase
@@ -55,8 +55,8 @@ class ManipulatorTorus(ManipulatorBase):
     """A ring about the local y axis: `major_radius` to the tube's centre and `tube_radius`, length units."""
 
     kind: Literal["Torus"] = "Torus"
-    major_radius: PositiveFloat
-    tube_radius: PositiveFloat
+    major_radius: Length
+    tube_radius: Length
 
     def shape(self, *, gap: Tensor | float | None = None) -> ShapeTorus:
         """See `ManipulatorBase`."""

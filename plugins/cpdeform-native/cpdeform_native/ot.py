@@ -13,6 +13,7 @@ from torch import Tensor
 from cpdeform.core.errors import InputError, MissingExtraError
 from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.machine import available_cores
+from cpdeform.core.options import MOST_THREADS, real_number, whole_number
 from cpdeform.core.ot import OTCapabilities, OTResult, OTSolver, fix_gauge
 from cpdeform.ot.divergence import Potentials, Problem, check_options, usable_state
 
@@ -130,23 +131,24 @@ class OTSolverNative(OTSolver):
     ) -> None:
         prepare_for_forks()
         check_options(blur=blur, exponent=exponent, tolerance=tolerance, iterations=iterations, warm_iterations=warm_iterations)
-        for name, value in (("scaling", scaling), ("warm_tolerance", warm_tolerance)):
-            if not 0 < value < 1:
-                raise InputError(name, came=f"{value}", expected="a number between 0 and 1")
-        if threads is not None and threads < 1:
-            raise InputError("threads", came=f"{threads}", expected="at least 1, or None")
+        real_number("scaling", scaling, least=1e-3, most=0.99, expected="a number between 0 and 1")
+        real_number("warm_tolerance", warm_tolerance, least=1e-12, most=1.0 - 1e-12, expected="a number between 0 and 1")
+        if not isinstance(debias, bool):
+            raise InputError("debias", came=f"{debias!r}", expected="True or False")
+        if threads is not None:
+            threads = whole_number("threads", threads, least=1, most=MOST_THREADS)
         known = _transport.instruction_sets()
         if instruction_set is not None and instruction_set not in known:
             raise InputError(
                 "instruction_set", came=repr(instruction_set), expected=f"one that this processor has: {', '.join(known)}"
             )
         self.blur = float(blur)
-        self.exponent = exponent
+        self.exponent = int(exponent)
         self.debias = debias
         self.scaling = scaling
         self.tolerance = tolerance
-        self.iterations = iterations
-        self.warm_iterations = warm_iterations
+        self.iterations = int(iterations)
+        self.warm_iterations = int(warm_iterations)
         self.warm_tolerance = warm_tolerance
         self.threads = threads or available_cores()
         self._engine = _transport.Solver(self.threads, instruction_set or "")

@@ -12,7 +12,6 @@ from torch import Tensor
 from cpdeform.backends.checkpointing import SimulatorCheckpointing
 from cpdeform.backends.scene_numbers import material_numbers, scene_numbers, tool_numbers
 from cpdeform.core.errors import CapabilityError, InputError, MissingExtraError
-from cpdeform.core.machine import available_cores
 from cpdeform.core.scene import WALL_NODES, Scene
 from cpdeform.core.simulator import RolloutGradient, SimulatorCapabilities, Trajectory
 from cpdeform.core.state import State
@@ -79,7 +78,6 @@ class SimulatorNative(SimulatorCheckpointing):
             raise InputError(
                 "instruction_set", came=repr(instruction_set), expected=f"one that this processor has: {', '.join(known)}"
             )
-        self.threads = threads or available_cores()
         engine = _simulator.SimulatorFloat if self.dtype is torch.float32 else _simulator.SimulatorDouble
         material = np.ascontiguousarray(material_numbers(scene).T)
         self._engine = engine(_native_scene(scene), material, self.threads, instruction_set or "")
