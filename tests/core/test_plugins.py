@@ -88,7 +88,7 @@ def test_no_plugin_takes_the_place_of_a_built_in_part(monkeypatch):
     mine = plugin(monkeypatch, "aaa", cpdeform_simulators=lambda: [PluginSpec("warp", "json:loads", "")])
     registry = load_registry([mine, *importlib.metadata.entry_points(group="cpdeform")])
     assert registry.find("simulator", "warp").spec.target.startswith("cpdeform.")
-    assert [failure.entry_point for failure in registry.failures] == ["aaa"]
+    assert "aaa" in [failure.entry_point for failure in registry.failures]
 
 
 class Bare(BaseException):
