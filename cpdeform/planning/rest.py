@@ -32,7 +32,7 @@ from cpdeform.planning.shape_metrics import GoalShape
 TOLERANCE = 1e-4
 """Motion of a particle at rest, in cells per environment step, at most."""
 
-STEP_LIMIT = 1000
+STEP_LIMIT = 500
 """Environment steps after which clay that still moves is given up."""
 
 CALM_STEPS = 5
@@ -74,7 +74,8 @@ class SettledGoal:
 
     Attributes:
         position: The goal's particles (M, 3), moved straight down and not deformed, length units.
-        drop: How far they were moved down, length units: the mean over the particles when they were let go as clay.
+        drop: How far they were moved down, length units: the mean over the particles when they were let go as clay, but not below
+            the ground.
         let_go: Where they came to rest as clay (M, 3), length units.
         self_iou: Volume IoU of these two: 1 for a shape that clay keeps, less for one that sags or falls apart.
         steps: Environment steps until they rested.
@@ -292,7 +293,9 @@ def settle_goal(
     start = dataclasses.replace(start, position=target.detach().to(start.position).unsqueeze(0).contiguous())
     found = rest(simulator, start, step_limit=step_limit, tolerance=tolerance, stray_share=stray_share, damped=damped)
     let_go = found.state.position[0].to(target)
-    drop = float((target - let_go)[:, 1].double().mean())
+    # A shape that collapses sinks farther on average than it can be put down whole.
+    room = float(target[:, 1].min()) - simulator.scene.domain[0][1]
+    drop = min(float((target - let_go)[:, 1].double().mean()), max(room, 0.0))
     moved = target.detach().clone()
     moved[:, 1] -= drop
     return SettledGoal(
