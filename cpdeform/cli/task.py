@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cpdeform.cli.task_generate import generate_command
+
 if TYPE_CHECKING:
     from cpdeform.tasks.grid_import import ImportedGrid
 
@@ -16,6 +18,9 @@ task = typer.Typer(no_args_is_help=True, help="Make files that tasks are made of
 @task.callback()
 def task_group() -> None:
     """Make files that tasks are made of."""
+
+
+task.command("generate")(generate_command)
 
 
 @task.command("import-grid")

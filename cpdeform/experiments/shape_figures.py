@@ -22,11 +22,12 @@ SHAPE_FIGURES = (
 """Fields of a row that `shape_figures` gives."""
 
 SHAPE_NOTE = (
-    "Shape IoU: cells of the grid that are full in result and goal, over those that are full in either; silhouette IoU: the same "
-    "of the outlines along an axis (y: from above); start, result and goal at rest, tools away. The ceiling is what a random "
-    "sample of the goal's own shape has; normalised: (final - start) / (ceiling - start). Loose share: particles in cells that are not "
-    "full, beyond those of such a sample. 95% distance: 95th percentile of the distance between the surfaces, from the result to "
-    "the goal and back. Goals in the air, of tasks that carry clay, lose their height when they come to rest."
+    "Shape IoU: cells of the grid that are full in result and goal, over those that are full in either; silhouette IoU: "
+    "the same of the outlines along an axis (y: from above); start, result and goal at rest, tools away. The ceiling is "
+    "what a random sample of the goal's own shape has; normalised: (final - start) / (ceiling - start). Loose share: "
+    "particles in cells that are not full, beyond those of such a sample. 95% distance: 95th percentile of the distance "
+    "between the surfaces, from the result to the goal and back. Goals in the air, of tasks that carry clay, lose their "
+    "height when they come to rest."
 )
 
 
