@@ -22,6 +22,9 @@ GAP = 0.06
 MARGIN = 0.08
 """Distance from the domain's faces, length units."""
 
+LEAST_WAY = 0.1
+"""How far some part of a rope is moved, length units, at least."""
+
 ATTEMPTS = 1000
 
 
@@ -45,7 +48,9 @@ def random_rope(scene: Scene, rng: np.random.Generator) -> Array:
         if np.abs(headings).max() > math.radians(100.0) or np.abs(np.diff(headings)).max() < math.radians(30.0):
             continue
         position = bent_rope(scene, headings=[float(heading) for heading in headings], corner_length=0.1)
-        if _has_room(position, scene) and _apart_from_itself(sample_particles(scene), position, width=body.half_extents[2]):
+        start = sample_particles(scene)
+        moved = float(np.linalg.norm(position - start, axis=1).max()) >= LEAST_WAY
+        if moved and _has_room(position, scene) and _apart_from_itself(start, position, width=body.half_extents[2]):
             return position
     raise InputError("scene", came="a rope that could not be bent", expected="room on the floor around it")
 

@@ -75,6 +75,9 @@ def random_solid(scene: Scene, rng: np.random.Generator) -> tuple[str, Solid]:
             solid = makers[names[number]](rng, scene).fitted_to(volume)
             low, high = solid.corners
             sideways = (low < lower - REACH)[[0, 2]].any() or (high > upper + REACH)[[0, 2]].any()
+            # Thinner than a tool throughout: no need to look closer, at more voxels the smaller the solid is.
+            if (high - low).min() < TOOL:
+                continue
             if sideways or high[1] > upper[1] + REACH or low[0] < MARGIN or low[2] < MARGIN or high.max() > 1.0 - MARGIN:
                 continue
             if max(thin_shares(solid)) <= LOST_SHARE:
