@@ -170,7 +170,7 @@ def test_dents_are_made_by_the_ball():
     start = sample_particles(task.scene)
     assert goal.corresponds
     motion = np.linalg.norm(goal.position - start, axis=1)
-    assert motion.max() > 0.012  # the ball pressed some clay in
+    assert motion.max() > 0.03  # the ball pressed some clay in
     assert np.median(motion) < 0.02  # and left most of it where it was
 
 

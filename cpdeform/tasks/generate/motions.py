@@ -95,7 +95,9 @@ def _strokes(rng: np.random.Generator) -> tuple[Polyline, ...]:
 
 
 def dent_motion(scene: Scene, rng: np.random.Generator) -> tuple[str, list[Leg]]:
-    """A ball presses 3 to 5 dents of 0.02 to 0.05 into the top and the sides of a block, apart from one another.
+    """A ball presses 3 to 5 dents into the top and the sides of a block, apart from one another.
+
+    They are 0.05 to 0.085 deep, a little less once the ball is away.
 
     Args:
         scene: Its first tool is the ball, its first body the block.
@@ -116,7 +118,7 @@ def dent_motion(scene: Scene, rng: np.random.Generator) -> tuple[str, list[Leg]]
     steps, scale = 6, ball.action_scale[0]
     for _ in range(200):
         contact, inward = _contact(block, rng)
-        way = CLEAR + float(rng.uniform(0.02, 0.05))
+        way = CLEAR + float(rng.uniform(0.05, 0.085))
         start = [c - i * (ball.radius + CLEAR) for c, i in zip(contact, inward, strict=True)]
         bounds = zip(start, ball.lower_bound, ball.upper_bound, strict=True)
         close = [np.linalg.norm(np.subtract(contact, other)) < 2.6 * ball.radius for other in contacts]
