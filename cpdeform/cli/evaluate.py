@@ -24,6 +24,9 @@ def evaluate(
         float | None, typer.Option(help="Its blur.  [default: 1e-3, or 1e-5 for tasks of several stages]", metavar="LENGTH")
     ] = None,
     exact: Annotated[bool, typer.Option("--exact", help="Also the exact Wasserstein distance (minutes, gigabytes).")] = False,
+    at_rest: Annotated[
+        bool, typer.Option("--rest/--no-rest", help="Let start, result and goal come to rest before their shapes are compared.")
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Compute the figures that results are compared by, the same way for every method."""
@@ -31,16 +34,19 @@ def evaluate(
     from cpdeform.run.evaluation import evaluate_record
     from cpdeform.run.record import load_record
     from cpdeform.run.record_files import to_json
+    from cpdeform.run.shape_evaluation import evaluate_shape_record
+    from cpdeform.run.shape_text import shape_text
 
     if paper_blur is not None and not 0.0 < paper_blur < float("inf"):
         raise InputError("--paper-blur", came=f"{paper_blur}", expected="a positive length, such as 1e-3")
     record = load_record(directory)
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         result = evaluate_record(record, paper=paper or paper_blur is not None, paper_blur=paper_blur, exact=exact)
+        shape = evaluate_shape_record(record, from_rest=at_rest)
     if as_json:
-        typer.echo(json.dumps(to_json({"record": str(directory), **dataclasses.asdict(result)})))
+        typer.echo(json.dumps(to_json({"record": str(directory), **dataclasses.asdict(result), **shape.as_dict()})))
     else:
-        typer.echo(_text(result))
+        typer.echo(f"{_text(result)}\n{shape_text(shape)}")
 
 
 def _text(result: Evaluation) -> str:

@@ -72,6 +72,7 @@ def experiment(
         bool, typer.Option("--equal-evaluations", help="Give fixed as many gradient evaluations per stage as cpdeform used.")
     ] = False,
     paper_metric: Annotated[bool, typer.Option("--paper-metric", help="Also take W1 with the paper's settings.")] = False,
+    shape: Annotated[bool, typer.Option("--shape", help="Also take the shape figures, from rest to rest.")] = False,
     out: Annotated[
         Path | None, typer.Option(help="Directory of records and tables.  [default: experiments/<experiment>]", metavar="DIR")
     ] = None,
@@ -142,7 +143,7 @@ def _recorded(name: str, given: dict[str, Any], *, resume: bool) -> tuple[Iterat
         methods=None if methods is None else split_names(methods, "--methods"),
         seeds=None if seeds is None else split_numbers(seeds, "--seeds"),
     )
-    rows = (read_row(run, paper_metric=given["paper_metric"], reused=True) for run in runs)
+    rows = (read_row(run, paper_metric=given["paper_metric"], shape=given["shape"], reused=True) for run in runs)
     return rows, len(runs), {"out": str(given["out"])}
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cpdeform.cli.task_check import task_check_command
+from cpdeform.cli.task_generate import generate_command
 
 if TYPE_CHECKING:
     from cpdeform.tasks.grid_import import ImportedGrid
@@ -21,6 +22,9 @@ def task_group() -> None:
 
 
 task.command("check")(task_check_command)
+
+
+task.command("generate")(generate_command)
 
 
 @task.command("import-grid")

@@ -93,7 +93,7 @@ def _row(
             _make(run, resolved, observe)
     except Exception as error:
         return note_failure(run, error)
-    return read_row(run, paper_metric=settings.paper_metric, reused=reused)
+    return read_row(run, paper_metric=settings.paper_metric, shape=settings.shape, reused=reused)
 
 
 def _make(run: PlannedRun, resolved: ResolvedRun, observe: Observe) -> None:

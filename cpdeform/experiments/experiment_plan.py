@@ -69,6 +69,7 @@ class ExperimentSettings:
         options: Further fields of `RunConfiguration`, nested, for every run.
         equal_evaluations: Give ``fixed`` as many gradient evaluations per stage as ``cpdeform`` used.
         paper_metric: Also take W1 with the paper's settings.
+        shape: Also take the shape figures, from rest to rest.
 
     Raises:
         InputError: A list is empty or holds something twice, a number is out of range, a method is unknown, or an option is one
@@ -90,6 +91,7 @@ class ExperimentSettings:
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     equal_evaluations: bool = False
     paper_metric: bool = False
+    shape: bool = False
 
     def __post_init__(self) -> None:
         for name in ("tasks", "methods", "seeds"):

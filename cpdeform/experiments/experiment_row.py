@@ -13,6 +13,7 @@ from cpdeform import __version__
 from cpdeform.core.errors import CpdeformError, InputError
 from cpdeform.core.reading.json_text import read_json
 from cpdeform.experiments.experiment_plan import PlannedRun
+from cpdeform.experiments.shape_figures import SHAPE_FIGURES, shape_figures
 from cpdeform.planning.result import Status
 from cpdeform.run.record_files import replacing, to_json, write_json
 from cpdeform.run.record_reader import RunRecord, load_record
@@ -35,6 +36,7 @@ FIGURES = (
     "w1_paper_final",
     "w1_paper_floor",
     "w1_paper_blur",
+    *SHAPE_FIGURES,
 )
 """Fields of a row that `judge` gives."""
 
@@ -66,6 +68,17 @@ class ExperimentRow:
         w1_paper_final: The same between the last state and the goal.
         w1_paper_floor: As `w1_floor`, with the paper's settings.
         w1_paper_blur: Entropic blur of both, length units.
+        shape_iou_start: This and the fields up to `distance_95_goal_to_result` are those of
+            `cpdeform.planning.shape_metrics.ShapeFigures`, from rest to rest.
+        shape_iou_final: See there.
+        shape_iou_ceiling: See there.
+        normalised_shape_iou: See there.
+        silhouette_iou_x: Silhouette IoU along x.
+        silhouette_iou_y: That along y, from above.
+        silhouette_iou_z: That along z.
+        loose_share: See there.
+        distance_95_result_to_goal: See there, in cells.
+        distance_95_goal_to_result: See there, in cells.
         gradient_evaluations: Gradient evaluations of all stages and worlds.
         iterations: The most gradient evaluations per stage and world.
         seconds: Wall time of the run.
@@ -94,6 +107,16 @@ class ExperimentRow:
     w1_paper_final: float | None = None
     w1_paper_floor: float | None = None
     w1_paper_blur: float | None = None
+    shape_iou_start: float | None = None
+    shape_iou_final: float | None = None
+    shape_iou_ceiling: float | None = None
+    normalised_shape_iou: float | None = None
+    silhouette_iou_x: float | None = None
+    silhouette_iou_y: float | None = None
+    silhouette_iou_z: float | None = None
+    loose_share: float | None = None
+    distance_95_result_to_goal: float | None = None
+    distance_95_goal_to_result: float | None = None
     gradient_evaluations: int | None = None
     iterations: int | None = None
     seconds: float | None = None
@@ -111,13 +134,14 @@ class ExperimentRow:
         return self.w1_final is not None or self.incremental_iou is not None
 
 
-def read_row(run: PlannedRun, *, paper_metric: bool, reused: bool) -> ExperimentRow:
+def read_row(run: PlannedRun, *, paper_metric: bool, reused: bool, shape: bool = False) -> ExperimentRow:
     """The row of a run, from its record or from the note of its failure.
 
     Args:
         run: The run.
         paper_metric: Also take W1 with the paper's settings.
         reused: Whether the run was found, not made.
+        shape: Also take the shape figures.
     """
     base: dict[str, Any] = {"task": run.task, "method": run.method, "seed": run.seed, "reused": reused}
     try:
@@ -132,7 +156,7 @@ def read_row(run: PlannedRun, *, paper_metric: bool, reused: bool) -> Experiment
         return ExperimentRow(**base, status="not_run")
     try:
         record = load_record(run.directory)
-        return _recorded_row(record, base, paper_metric=paper_metric)
+        return _recorded_row(record, base, paper_metric=paper_metric, shape=shape)
     except CpdeformError as error:
         return ExperimentRow(**base, status="failed", reason=one_line(error))
 
@@ -169,7 +193,7 @@ def without_directories(text: str) -> str:
     return re.sub(r"(?<![\w./~-])/(?:[^\s/\"':,]+/)+(?=[^\s/\"':,])", "", text)
 
 
-def _recorded_row(record: RunRecord, base: Mapping[str, Any], *, paper_metric: bool) -> ExperimentRow:
+def _recorded_row(record: RunRecord, base: Mapping[str, Any], *, paper_metric: bool, shape: bool) -> ExperimentRow:
     configuration = recorded_configuration(record)
     values: dict[str, Any] = {
         "status": "interrupted" if record.status == "running" else record.status,
@@ -186,7 +210,7 @@ def _recorded_row(record: RunRecord, base: Mapping[str, Any], *, paper_metric: b
     }
     if record.stages:
         try:
-            figures = _figures(record, paper_metric=paper_metric)
+            figures = _figures(record, paper_metric=paper_metric, shape=shape)
             values |= figures | {"ratio_above_floor": ratio_above_floor(figures)}
             if figures["w1_converged"] is False:
                 values["reason"] = " ".join(filter(None, (values["reason"], "W1 did not converge.")))
@@ -204,26 +228,31 @@ def ratio_above_floor(figures: Mapping[str, float | None]) -> float | None:
     return (final - floor) / (initial - floor)
 
 
-def _figures(record: RunRecord, *, paper_metric: bool) -> dict[str, Any]:
+def _figures(record: RunRecord, *, paper_metric: bool, shape: bool) -> dict[str, Any]:
     """Figures of a record: those beside it where they belong to it, else computed and kept there."""
     path = record.directory / EVALUATION_FILE
     key = {"recorded_at": record.run.get("recorded_at"), "stages": len(record.stages), "version": __version__}
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         kept = read_json(path, argument=str(path))
-        if kept["key"] == key and (kept["paper_metric"] or not paper_metric):
-            return {name: kept["figures"][name] for name in FIGURES}
-    figures = judge(record, paper_metric=paper_metric)
+        if kept["key"] == key:
+            if kept["paper_metric"] >= paper_metric and kept["shape"] >= shape:
+                return {name: kept["figures"][name] for name in FIGURES}
+            # What is there already is not lost where more is asked for.
+            paper_metric, shape = paper_metric or kept["paper_metric"], shape or kept["shape"]
+    figures = judge(record, paper_metric=paper_metric, shape=shape)
+    content = {"key": key, "paper_metric": paper_metric, "shape": shape, "figures": figures}
     with contextlib.suppress(OSError), replacing(path) as temporary:
-        temporary.write_text(json.dumps({"key": key, "paper_metric": paper_metric, "figures": figures}), encoding="utf-8")
+        temporary.write_text(json.dumps(content), encoding="utf-8")
     return figures
 
 
-def judge(record: RunRecord, *, paper_metric: bool) -> dict[str, Any]:
+def judge(record: RunRecord, *, paper_metric: bool, shape: bool = False) -> dict[str, Any]:
     """Judge the last state of a record against its start and its goal, the same way for every method.
 
     Args:
         record: A record with at least one stage.
         paper_metric: Also take W1 with the paper's settings.
+        shape: Also take the shape figures, from rest to rest.
 
     Returns:
         The figures `FIGURES`, W1 in length units; None for one that was not asked for or is not finite.
@@ -244,5 +273,6 @@ def judge(record: RunRecord, *, paper_metric: bool) -> dict[str, Any]:
         "w1_paper_final": found.paper_final,
         "w1_paper_floor": found.paper_floor,
         "w1_paper_blur": found.paper_blur,
+        **(shape_figures(record) if shape else dict.fromkeys(SHAPE_FIGURES)),
     }
     return {name: to_json(figures[name]) for name in FIGURES}

@@ -17,6 +17,7 @@ from cpdeform.core.reading.json_text import read_json
 from cpdeform.experiments.experiment import family
 from cpdeform.experiments.experiment_plan import METHODS, MULTI_STAGE, OWN_OPTIONS, SINGLE_STAGE
 from cpdeform.experiments.experiment_row import ExperimentRow
+from cpdeform.experiments.shape_figures import SHAPE_FIGURES, SHAPE_NOTE
 from cpdeform.experiments.tables import cell, machine_line, markdown
 from cpdeform.run.record_files import replacing, to_json
 
@@ -37,12 +38,22 @@ COLUMNS: Mapping[str, tuple[str, str]] = {
     "w1_paper_initial": ("paper's W1 initial", ".5f"),
     "w1_paper_final": ("paper's W1 final", ".5f"),
     "w1_paper_floor": ("paper's W1 floor", ".5f"),
+    "shape_iou_start": ("shape IoU start", ".3f"),
+    "shape_iou_final": ("shape IoU final", ".3f"),
+    "shape_iou_ceiling": ("shape IoU ceiling", ".3f"),
+    "normalised_shape_iou": ("normalised shape IoU", ".3f"),
+    "silhouette_iou_x": ("silhouette IoU x", ".3f"),
+    "silhouette_iou_y": ("silhouette IoU y", ".3f"),
+    "silhouette_iou_z": ("silhouette IoU z", ".3f"),
+    "loose_share": ("loose share", ".3f"),
+    "distance_95_result_to_goal": ("95% distance to goal, cells", ".1f"),
+    "distance_95_goal_to_result": ("95% distance from goal, cells", ".1f"),
     "gradient_evaluations": ("gradient evaluations", "d"),
     "seconds": ("seconds", ".0f"),
 }
 """Title and format of the columns of the table of runs."""
 
-OPTIONAL_COLUMNS = ("w1_paper_initial", "w1_paper_final", "w1_paper_floor")
+OPTIONAL_COLUMNS = ("w1_paper_initial", "w1_paper_final", "w1_paper_floor", *SHAPE_FIGURES)
 """Left out where no row has the figure."""
 
 FIGURES: Mapping[str, tuple[str, str]] = {
@@ -140,6 +151,8 @@ def table_text(name: str, rows: Sequence[ExperimentRow], *, sessions: Sequence[M
     parts = [f"# Experiment {name}", f"{done}.", runs_table(rows), *_reasons(rows), NOTES]
     if any(row.goal_particles not in (None, row.particles) for row in rows):
         parts.append(FLOOR_NOTE)
+    if any(row.shape_iou_final is not None for row in rows):
+        parts.append(SHAPE_NOTE)
     blurs = sorted({row.w1_paper_blur for row in rows if row.w1_paper_blur is not None})
     if blurs:
         parts.append(f"Paper's W1: GeomLoss's default schedule, blur {' or '.join(f'{blur:g}' for blur in blurs)}, not converged.")

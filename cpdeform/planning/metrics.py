@@ -18,6 +18,11 @@ from cpdeform.planning.objectives.metrics import incremental_iou
 METRIC_BLUR = 1e-3
 """Entropic blur of the Wasserstein metric, length units; the paper's for a single stage."""
 
+EVEN_SPREAD = 0.25
+"""Standard deviation of the distances between nearest neighbours, over their mean, below which a goal counts as sampled evenly.
+
+At random it is 0.36 in the bulk; 0.06 to 0.14 for the goals that `cpdeform.tasks` makes and imports, 0.24 for a Sobol sequence."""
+
 
 @dataclasses.dataclass(frozen=True)
 class MetricValues:

@@ -23,7 +23,7 @@ from cpdeform.core.ot import OTSolver
 from cpdeform.core.plugins import AUTO, Registry, load_registry
 from cpdeform.core.sampling import sample_particles
 from cpdeform.core.task import Task
-from cpdeform.planning.metrics import metric_solver, target_mass_grid, wasserstein
+from cpdeform.planning.metrics import EVEN_SPREAD, metric_solver, target_mass_grid, wasserstein
 from cpdeform.planning.objectives.mass import mass_grid
 from cpdeform.planning.objectives.metrics import incremental_iou, soft_iou
 from cpdeform.run.record_files import TARGET_FILE
@@ -37,11 +37,6 @@ MAX_EMD_PAIRS = 2 * 10**8
 
 NEARLY_EXACT_BLUR = 1e-4
 """Blur of the Sinkhorn divergence that stands for the exact distance where `ot.emd2` cannot compute it, length units."""
-
-EVEN_SPREAD = 0.25
-"""Standard deviation of the distances between nearest neighbours, over their mean, below which a goal counts as sampled evenly.
-
-At random it is 0.36 in the bulk; 0.06 to 0.14 for the goals that `cpdeform.tasks` makes and imports, 0.24 for a Sobol sequence."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -52,6 +52,11 @@ def write(
     return legs
 
 
+def draw(lines: Sequence[Sequence[tuple[float, float]]], *, pen_height: float, depth: float, scale: float) -> list[Leg]:
+    """The motion that draws lines, each given by its corners (x, z) in length units; the other arguments are as for `write`."""
+    return [leg for corners in lines for leg in _stroke(corners, pen_height=pen_height, depth=depth, scale=scale)]
+
+
 def _stroke(corners: Sequence[tuple[float, float]], *, pen_height: float, depth: float, scale: float) -> list[Leg]:
     """Down, along the corners, and up again."""
     steps = int(np.ceil(depth / STEP_LENGTH))

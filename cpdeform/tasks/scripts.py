@@ -50,10 +50,15 @@ def perform(legs: Sequence[Leg], simulator: Simulator) -> NDArray[np.float64]:
     Returns:
         Particle positions (N, 3), length units.
     """
+    return np.asarray(perform_state(legs, simulator).position[0].double().cpu().numpy())
+
+
+def perform_state(legs: Sequence[Leg], simulator: Simulator) -> State:
+    """The state, a single world, after a scripted motion; arguments as for `perform`."""
     state = simulator.initial_state(batch_size=1)
     for leg in legs:
         state = simulator.rollout(_placed(state, leg), leg.action_rows(simulator.scene).unsqueeze(0)).final_state
-    return np.asarray(state.position[0].double().cpu().numpy())
+    return state
 
 
 def _placed(state: State, leg: Leg) -> State:

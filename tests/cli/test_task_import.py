@@ -83,14 +83,14 @@ def test_run_takes_the_goal_and_evaluate_its_grid(directory, grid):
     summary = json.loads(run.stdout)
     assert summary["metric_initial"] > 0.0
     for flags in ([], ["--exact"], ["--paper", "--paper-blur", "0.01"]):
-        found = CliRunner().invoke(app, ["evaluate", "run", "--json", *flags])
+        found = CliRunner().invoke(app, ["evaluate", "run", "--json", "--no-rest", *flags])
         assert found.exit_code == 0, found.output
         figures = json.loads(found.stdout)
         assert (figures["grid"], figures["particle_count"], figures["target_count"]) == ("file", COUNT, 300)
         assert figures["wasserstein_final"] == pytest.approx(summary["metric_value"], rel=1e-3)
         assert (figures["exact_final"] is None) == ("--exact" not in flags)
         assert figures["paper_blur"] == (0.01 if "--paper" in flags else None)
-    text = CliRunner().invoke(app, ["evaluate", "run"]).stdout
+    text = CliRunner().invoke(app, ["evaluate", "run", "--no-rest"]).stdout
     for part in ("incremental IoU", "Wasserstein-1", "floor", "node masses from its file"):
         assert part in text
     assert CliRunner().invoke(app, ["evaluate", "run", "--paper-blur", "0"]).exit_code == 2

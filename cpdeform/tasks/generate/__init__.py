@@ -1,0 +1,1 @@
+"""Random goals for the scenes of tasks, reproducible from a seed."""
