@@ -1,0 +1,52 @@
+"""A drag along a side: friction takes the clay with it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from cpdeform.placement.touches.touch import Move, Room, Touch, Vector, aside, facing, moved, scaled, turned_aside, unit
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TouchDrag(Touch):
+    """One tool beside the clay closes in a little and moves along.
+
+    Attributes:
+        tool: Index of the tool.
+        contact: Contact point (3,), length units.
+        direction: Where it drags the clay (3,).
+        way: How far, length units.
+        side: On which side it is, an angle about the direction, radians; see `aside`.
+        closing: How far it closes in, length units.
+    """
+
+    name: ClassVar[str] = "drag"
+    tool: int
+    contact: Vector
+    direction: Vector
+    way: float
+    side: float
+    closing: float
+
+    def moves(self, room: Room) -> dict[int, Move] | None:
+        """See `Touch`."""
+        direction = unit(self.direction, room.particles)
+        inward = -aside(direction, self.side)
+        rotation = facing(room.scene.manipulators[self.tool], inward, edge=False, roll=0.0)
+        pose = room.behind(self.tool, rotation, torch.as_tensor(self.contact).to(direction), inward)
+        return None if pose is None else {self.tool: Move(pose, self.way * direction + self.closing * inward)}
+
+    def varied(self, generator: np.random.Generator, width: float) -> TouchDrag:
+        """See `Touch`."""
+        return dataclasses.replace(
+            self,
+            contact=moved(self.contact, generator, width),
+            direction=turned_aside(self.direction, generator, width),
+            way=scaled(self.way, generator, width),
+            side=self.side + 0.12 * width * float(generator.standard_normal()),
+            closing=scaled(self.closing, generator, width),
+        )

@@ -1,0 +1,197 @@
+"""The interface of touches, and the room that they are placed in."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import math
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cpdeform.core.rotation import multiply, rotate
+from cpdeform.core.scene import Manipulator, Scene
+from cpdeform.core.signed_distance import signed_distance
+from cpdeform.placement.tool import placed_surface, tool_half_extents
+from cpdeform.placement.touch import exit_distances
+
+CLEARANCE = 5e-4
+"""Distance from the clay at which a tool begins, length units."""
+
+REACH = 0.4
+"""How far behind a contact point a tool is looked for, length units."""
+
+BETWEEN_TOOLS = 1e-3
+"""Least distance between tools, length units."""
+
+Vector = np.ndarray[tuple[int], np.dtype[np.float64]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Move:
+    """What a touch does with one tool.
+
+    Attributes:
+        pose: Its pose (8,) at the beginning.
+        way: Where it goes from there, a vector (3,), length units.
+    """
+
+    pose: Tensor
+    way: Tensor
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Room:
+    """The clay of a stage and the tools that may touch it.
+
+    Attributes:
+        scene: Its tools.
+        particles: All particles (N, 3), length units.
+        poses: Poses (M, 8) of all tools at the stage's start.
+        floor: Height of the lowest particle, length units: no tool goes below.
+    """
+
+    scene: Scene
+    particles: Tensor
+    poses: Tensor
+    floor: float
+
+    @property
+    def movable(self) -> list[int]:
+        """Indices of the movable tools."""
+        return [index for index, tool in enumerate(self.scene.manipulators) if tool.movable]
+
+    def behind(self, index: int, rotation: Tensor, contact: Tensor, direction: Tensor) -> Tensor | None:
+        """Pose of a tool moved from a contact point against a direction until it is just free of the clay.
+
+        Args:
+            index: The tool.
+            rotation: Its rotation (4,), unit quaternion wxyz.
+            contact: Contact point (3,), length units; raised where the tool would reach below the floor.
+            direction: Unit vector (3,) in which the tool is to push.
+
+        Returns:
+            The pose (8,); None where there is no room within the tool's bounds and above the floor.
+        """
+        tool = self.scene.manipulators[index]
+        low = self.floor + float(tool_half_extents(tool, rotation)[1])
+        start = contact.clone()
+        start[1] = max(float(start[1]), low)
+        length = exit_distances(
+            tool, rotation, start.unsqueeze(0), -direction, self.particles, reach=REACH, clearance=CLEARANCE
+        )[0]
+        position = start - length * direction
+        lower, upper = position.new_tensor(tool.lower_bound), position.new_tensor(tool.upper_bound)
+        inside = bool(torch.isfinite(length)) and bool(((position >= lower) & (position <= upper)).all())
+        if not inside or float(position[1]) < low - 1e-6:
+            return None
+        return torch.cat([position, rotation, self.poses[index, 7:]])
+
+    def apart(self, moves: dict[int, Move]) -> bool:
+        """Whether the tools of a touch are free of each other and of the other tools."""
+        poses = self.poses.clone()
+        for index, move in moves.items():
+            poses[index] = move.pose
+        for index in moves:
+            surface = placed_surface(self.scene.manipulators[index], poses[index])
+            for other, tool in enumerate(self.scene.manipulators):
+                if other != index and float(signed_distance(tool, poses[other], surface).min()) < BETWEEN_TOOLS:
+                    return False
+        return True
+
+
+class Touch(abc.ABC):
+    """A placement of some tools and their first motion, in a few numbers.
+
+    Attributes:
+        name: Short name.
+    """
+
+    name: ClassVar[str]
+
+    @abc.abstractmethod
+    def moves(self, room: Room) -> dict[int, Move] | None:
+        """What each of its tools does, by index; None where there is no room for it."""
+
+    @abc.abstractmethod
+    def varied(self, generator: np.random.Generator, width: float) -> Touch:
+        """A touch near this one.
+
+        Args:
+            generator: Source of randomness.
+            width: How far away, 1 for a wide search.
+        """
+
+
+def facing(tool: Manipulator, direction: Tensor, *, edge: bool, roll: float) -> Tensor:
+    """Rotation in which a flat tool turns its broad face (or its edge) along a direction, upright where it can be, then rolled.
+
+    Args:
+        tool: The tool; a round one keeps its start rotation.
+        direction: Unit vector (3,).
+        edge: Whether it is the edge.
+        roll: Angle about the direction, radians.
+
+    Returns:
+        Unit quaternion (4,), wxyz.
+    """
+    start = torch.as_tensor(tool.rotation_wxyz).to(direction)
+    thin = tool.thinnest_axis
+    if thin is None:
+        return start / start.norm()
+    normal, up = torch.zeros_like(direction), torch.zeros_like(direction)
+    normal[2 - thin if edge and thin != 1 else thin] = 1.0
+    up[1 if thin != 1 else 2] = 1.0
+    turn = turn_between(normal, direction)
+    now, wanted = rotate(turn, up), direction.new_tensor([0.0, 1.0, 0.0])
+    wanted = wanted - (wanted @ direction) * direction
+    if float(wanted.norm()) > 0.2:
+        wanted, now = wanted / wanted.norm(), now - (now @ direction) * direction
+        angle = math.atan2(float(torch.linalg.cross(now, wanted) @ direction), float(now @ wanted))
+        turn = multiply(turn_about(direction, angle), turn)
+    return multiply(turn_about(direction, roll), turn)
+
+
+def turn_between(first: Tensor, second: Tensor) -> Tensor:
+    """The smallest rotation (4,) that takes one unit vector (3,) to another."""
+    if float(first @ second) < -0.9999:
+        axis = torch.linalg.cross(first, first.new_tensor([0.3, 0.5, 0.8]))
+        return torch.cat([axis.new_zeros(1), axis / axis.norm()])
+    turn = torch.cat([(1.0 + first @ second).reshape(1), torch.linalg.cross(first, second)])
+    return turn / turn.norm()
+
+
+def turn_about(axis: Tensor, angle: float) -> Tensor:
+    """Rotation (4,) about a unit vector (3,) by an angle, radians."""
+    return torch.cat([axis.new_tensor([math.cos(0.5 * angle)]), math.sin(0.5 * angle) * axis])
+
+
+def aside(direction: Tensor, angle: float) -> Tensor:
+    """Unit vector (3,) across a direction: level for the angle 0, above it for a quarter turn."""
+    level = torch.linalg.cross(direction.new_tensor([0.0, 1.0, 0.0]), direction)
+    level = level / level.norm() if float(level.norm()) > 1e-3 else direction.new_tensor([1.0, 0.0, 0.0])
+    return rotate(turn_about(direction, angle), level)
+
+
+def moved(contact: Vector, generator: np.random.Generator, width: float) -> Vector:
+    """A contact point nearby."""
+    return contact + 0.012 * width * generator.standard_normal(3)
+
+
+def turned_aside(direction: Vector, generator: np.random.Generator, width: float) -> Vector:
+    """A direction nearby; one along an axis or in a plane stays there."""
+    free = np.abs(direction) > 1e-3 * np.linalg.norm(direction)
+    return direction + 0.12 * width * float(np.linalg.norm(direction)) * generator.standard_normal(3) * free
+
+
+def scaled(length: float, generator: np.random.Generator, width: float) -> float:
+    """A length nearby."""
+    return length * math.exp(0.3 * width * float(generator.standard_normal()))
+
+
+def unit(direction: Vector, like: Tensor) -> Tensor:
+    """A direction as a unit vector (3,) of the type of a tensor."""
+    vector = torch.as_tensor(direction).to(like)
+    return vector / vector.norm().clamp(min=1e-9)
