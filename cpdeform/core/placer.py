@@ -33,6 +33,7 @@ class Stage:
         generator: Source of randomness on the CPU, seeded by the run.
         loss: Loss of leaving the state as it is, objective units; nan where it is unknown.
         failed_contacts: Contact particles of the candidates of all stages since the last one that gained at least `LEAST_GAIN`.
+        step_count: Environment steps T of the stage in which the tools act.
     """
 
     index: int
@@ -43,6 +44,7 @@ class Stage:
     generator: torch.Generator
     loss: float = float("nan")
     failed_contacts: tuple[int, ...] = ()
+    step_count: int = 10
 
     @property
     def priorities(self) -> Tensor:

@@ -15,6 +15,11 @@ def cpdeform_placers() -> list[PluginSpec]:
             summary="one tool at the contact point that optimal transport discovers (the paper's method)",
         ),
         PluginSpec(
+            name="touch",
+            target="cpdeform.placement.touches.placer:PlacerTouch",
+            summary="many random touches where clay has far to go, to be screened; then variations of the best",
+        ),
+        PluginSpec(
             name="fixed",
             target="cpdeform.placement.fixed:PlacerFixed",
             summary="tools stay where they are (PlasticineLab)",

@@ -173,15 +173,18 @@ class Planner:
         """
         bench = self._workbench(start, index, state, before, warm)
         candidates = self._search(bench)
+        for phase in self._phases("search"):
+            candidates = phase.run(bench, candidates)
+            bench.lap(phase.name)
         # "execute the plan with the lowest loss"
         best = min(range(len(candidates)), key=lambda number: candidates[number].loss, default=None)
         execution = _Execution(bench.stage.loss, bench.warm)
         status = _search_status(candidates, best, bench.stage.loss)
         if best is not None and status is Status.FINISHED:
-            status = self._execute(bench, self._phases("round")[-1], candidates[best], execution)
+            status = self._execute(bench, self._phases("round", "search")[-1], candidates[best], execution)
         bench.lap("execution")
         if best is not None and status is Status.FINISHED:
-            for phase in self._phases("stage"):
+            for phase in self._phases("plan"):
                 for changed in phase.run(bench, [candidates[best]]):
                     self._execute(bench, phase, changed, execution)
                 bench.lap(phase.name)
@@ -224,7 +227,16 @@ class Planner:
     ) -> Workbench:
         """What the phases of a stage work with, transport solved."""
         generator, failed = stage_generator(self.seed, index), failed_contacts([*start.previous, *before])
-        stage = Stage(index, self.task.scene, state, start.target, None, generator, failed_contacts=failed)
+        stage = Stage(
+            index,
+            self.task.scene,
+            state,
+            start.target,
+            None,
+            generator,
+            failed_contacts=failed,
+            step_count=self.task.step_count,
+        )
         bench = Workbench(
             stage=stage,
             task=self.task,
@@ -269,12 +281,12 @@ class Planner:
         if not phase.accepts(loss, loss_before=bench.stage.loss, loss_now=execution.loss):
             return Status.NO_IMPROVEMENT
         execution.trajectory, execution.loss, execution.warm = trajectory, loss, warm
-        if phase.scope == "stage":
+        if phase.scope == "plan":
             execution.candidate = dataclasses.replace(candidate, actions=trajectory.actions[0], loss=loss)
         return Status.FINISHED
 
-    def _phases(self, scope: str) -> list[Phase]:
-        return [phase for phase in self.phases if phase.scope == scope]
+    def _phases(self, *scopes: str) -> list[Phase]:
+        return [phase for phase in self.phases if phase.scope in scopes]
 
     def _tell_iteration(self, index: int, iteration: Iteration) -> None:
         for observer in self.observers:

@@ -20,6 +20,11 @@ def cpdeform_strategies() -> list[PluginSpec]:
             summary="Algorithm 1 of the paper to the letter",
         ),
         PluginSpec(
+            name="sculpt",
+            target="cpdeform.planning.strategies.sculpt:StrategySculpt",
+            summary="many touches a stage, screened by rollouts, the best polished: shapes that one recognises",
+        ),
+        PluginSpec(
             name="look-ahead",
             target="cpdeform.planning.strategies.look_ahead:StrategyLookAhead",
             summary="a beam over stages: several states go on, the best path is kept",

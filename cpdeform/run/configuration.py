@@ -59,8 +59,10 @@ class ObjectiveConfiguration(FrozenModel):
     """What a plan's loss is.
 
     Attributes:
-        kind: ``"transport"``: transport cost between the last step's particles and the goal (the paper); ``"plasticinelab"``:
-            density, distance and contact terms of node masses, summed over all steps.
+        kind: ``"transport"``: transport cost between the last step's particles and the goal (the paper); ``"shape"``: the same and
+            the share of misplaced mass at several scales, see `cpdeform.planning.objectives.shape`; ``"plasticinelab"``: density,
+            distance and contact terms of node masses, summed over all steps.
+        density_weight: (``"shape"``) Weight of the misplaced mass, dimensionless.
         points: Particles that the transport loss is computed on, a fixed random subset; None for all.
         blur: Entropic blur of the transport loss, length units; at least a millionth of the domain's edge.
         refresh: Solve from scratch every so many evaluations, warm-started between.
@@ -73,7 +75,7 @@ class ObjectiveConfiguration(FrozenModel):
         contact: Kind of the contact term of ``"plasticinelab"``; see `cpdeform.planning.objectives.contact.contact_loss`.
     """
 
-    kind: Literal["transport", "plasticinelab"] = "transport"
+    kind: Literal["transport", "shape", "plasticinelab"] = "transport"
     points: Count | None = 10000
     blur: Length = 2e-3
     refresh: Count = 50
@@ -81,6 +83,7 @@ class ObjectiveConfiguration(FrozenModel):
     coast_steps: NonNegativeFloat = 0.0
     axis_scale: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (1.0, 1.0, 1.0)
     contact: ContactKind = "plasticinelab"
+    density_weight: NonNegativeFloat = 1.0
 
 
 class RefinementConfiguration(FrozenModel):

@@ -18,6 +18,7 @@ from cpdeform.planning.metrics import target_mass_grid
 from cpdeform.planning.objectives.density import ObjectiveDensity
 from cpdeform.planning.objectives.mass import mass_grid
 from cpdeform.planning.objectives.plasticinelab import ObjectivePlasticineLab
+from cpdeform.planning.objectives.shape import ObjectiveShape
 from cpdeform.planning.objectives.soft_iou import ObjectiveSoftIoU
 from cpdeform.planning.objectives.transport import ObjectiveTransport
 from cpdeform.planning.optimizer import TrajectoryOptimizer
@@ -101,7 +102,7 @@ def make_objective(
     solver = ot_solver
     if isinstance(solver, str):
         solver = _named_solver(solver, blur=options.blur, registry=registry)
-    return ObjectiveTransport(
+    transport = ObjectiveTransport(
         solver,
         target,
         scene=task.scene,
@@ -111,6 +112,10 @@ def make_objective(
         coast_steps=options.coast_steps,
         axis_scale=options.axis_scale,
     )
+    if options.kind == "transport":
+        return transport
+    start = simulator.initial_state(batch_size=1).position[0]
+    return ObjectiveShape(transport, task.scene, target, start, density_weight=options.density_weight)
 
 
 def make_refinement(

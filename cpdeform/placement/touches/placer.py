@@ -47,10 +47,10 @@ class _Search:
 class PlacerTouch(Placer):
     """Proposes many touches, to be screened by rollouts, then variations of those that did best.
 
-    A touch is a placement and a first motion in a few numbers: a push, a press from above, a drag along a side, a pinch of two tools, or
-    several at once. Contacts are drawn with the probability of how far transport (cost |x - y|^2) wants to move a particle: the
-    paper's priority as a prior. Tools begin free of the clay and above the floor, and back off at the end. Lengths follow from the
-    clay's volume and from what the tools can do in a stage.
+    A touch is a placement and a first motion in a few numbers: a push, a press from above, a drag along a side, a pinch of two
+    tools, or several at once. Contacts are drawn with the probability of how far transport (cost |x - y|^2) wants to move a
+    particle: the paper's priority as a prior. Tools begin free of the clay and above the floor, and back off at the end. Lengths
+    follow from the clay's volume and from what the tools can do in a stage.
 
     Args:
         count: Random touches of a stage.
@@ -64,9 +64,7 @@ class PlacerTouch(Placer):
 
     capabilities = PlacerCapabilities(needs_priorities=True, max_manipulators=None)
 
-    def __init__(
-        self, *, count: int = 96, variations: int = 32, widths: tuple[float, ...] = (1.0, 0.5), parents: int = 8
-    ) -> None:
+    def __init__(self, *, count: int = 96, variations: int = 32, widths: tuple[float, ...] = (1.0, 0.5), parents: int = 8) -> None:
         for name, number in (("count", count), ("variations", variations), ("parents", parents)):
             if number < 1:
                 raise InputError(name, came=str(number), expected="at least 1")
@@ -106,6 +104,14 @@ class PlacerTouch(Placer):
         search.rounds += 1
         return search.rounds <= len(self.widths) and bool(search.tried)
 
+    def _next(self, search: _Search, parents: list[tuple[Touch, int | None]] | None, width: float) -> tuple[Touch, int | None]:
+        """A random touch, or a variation of one of the parents; and the particle that the first of its family was drawn at."""
+        if parents is None:
+            touch = search.draw.draw()
+            return touch, search.room.nearest(touch.contact)
+        parent, family = parents[int(search.draw.generator.integers(len(parents)))]
+        return parent.varied(search.draw.generator, width), family
+
     def _propose(
         self, search: _Search, count: int, parents: list[tuple[Touch, int | None]] | None, width: float = 1.0
     ) -> list[Proposal]:
@@ -115,21 +121,14 @@ class PlacerTouch(Placer):
         for _ in range(TRIES * count):
             if len(proposals) == count:
                 break
-            if parents is None:
-                touch, family = search.draw.draw(), len(search.tried) + len(proposals)
-            else:
-                parent, family = parents[int(search.draw.generator.integers(len(parents)))]
-                touch = parent.varied(search.draw.generator, width)
-            placed = place(touch, search.room, steps=self._steps(search.stage))
+            touch, family = self._next(search, parents, width)
+            placed = place(touch, search.room, steps=search.stage.step_count)
             if placed is not None:
                 poses, actions = placed
                 proposals.append(Proposal(poses, float("nan"), label(touch), family, actions))
                 search.asked.append(touch)
                 search.parents.append(family)
         return proposals
-
-    def _steps(self, stage: Stage) -> int:
-        return stage.step_count
 
 
 def place(touch: Touch, room: Room, *, steps: int) -> tuple[Tensor, Tensor] | None:
@@ -193,7 +192,7 @@ def _begin(stage: Stage) -> _Search:
 
 
 def _clay_volume(scene: Scene) -> float:
-    return sum(body.shape().volume for body in scene.bodies)
+    return sum(body.volume for body in scene.bodies)
 
 
 def _out_of_the_way(stage: Stage, movable: list[int]) -> Tensor:

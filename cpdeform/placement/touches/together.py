@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from cpdeform.placement.touches.touch import Move, Room, Touch
+from cpdeform.placement.touches.touch import Move, Room, Touch, Vector
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -20,6 +20,11 @@ class TouchTogether(Touch):
 
     name: ClassVar[str] = "together"
     parts: tuple[Touch, ...]
+
+    @property
+    def contact(self) -> Vector:  # type: ignore[override]
+        """Contact point of the first part."""
+        return self.parts[0].contact
 
     def moves(self, room: Room) -> dict[int, Move] | None:
         """See `Touch`."""

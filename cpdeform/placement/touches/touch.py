@@ -63,6 +63,10 @@ class Room:
         """Indices of the movable tools."""
         return [index for index, tool in enumerate(self.scene.manipulators) if tool.movable]
 
+    def nearest(self, contact: Vector) -> int:
+        """Index of the particle nearest to a point (3,), length units."""
+        return int(torch.linalg.vector_norm(self.particles - torch.as_tensor(contact).to(self.particles), dim=-1).argmin())
+
     def behind(self, index: int, rotation: Tensor, contact: Tensor, direction: Tensor) -> Tensor | None:
         """Pose of a tool moved from a contact point against a direction until it is just free of the clay.
 
@@ -79,9 +83,7 @@ class Room:
         low = self.floor + float(tool_half_extents(tool, rotation)[1])
         start = contact.clone()
         start[1] = max(float(start[1]), low)
-        length = exit_distances(
-            tool, rotation, start.unsqueeze(0), -direction, self.particles, reach=REACH, clearance=CLEARANCE
-        )[0]
+        length = exit_distances(tool, rotation, start.unsqueeze(0), -direction, self.particles, reach=REACH, clearance=CLEARANCE)[0]
         position = start - length * direction
         lower, upper = position.new_tensor(tool.lower_bound), position.new_tensor(tool.upper_bound)
         inside = bool(torch.isfinite(length)) and bool(((position >= lower) & (position <= upper)).all())
@@ -107,9 +109,11 @@ class Touch(abc.ABC):
 
     Attributes:
         name: Short name.
+        contact: Contact point (3,), length units; of several tools, that of the first.
     """
 
     name: ClassVar[str]
+    contact: Vector
 
     @abc.abstractmethod
     def moves(self, room: Room) -> dict[int, Move] | None:
@@ -140,7 +144,7 @@ def facing(tool: Manipulator, direction: Tensor, *, edge: bool, roll: float) -> 
     start = torch.as_tensor(tool.rotation_wxyz).to(direction)
     thin = tool.thinnest_axis
     if thin is None:
-        return start / start.norm()
+        return _normalised(start)
     normal, up = torch.zeros_like(direction), torch.zeros_like(direction)
     normal[2 - thin if edge and thin != 1 else thin] = 1.0
     up[1 if thin != 1 else 2] = 1.0
@@ -159,8 +163,7 @@ def turn_between(first: Tensor, second: Tensor) -> Tensor:
     if float(first @ second) < -0.9999:
         axis = torch.linalg.cross(first, first.new_tensor([0.3, 0.5, 0.8]))
         return torch.cat([axis.new_zeros(1), axis / axis.norm()])
-    turn = torch.cat([(1.0 + first @ second).reshape(1), torch.linalg.cross(first, second)])
-    return turn / turn.norm()
+    return _normalised(torch.cat([(1.0 + first @ second).reshape(1), torch.linalg.cross(first, second)]))
 
 
 def turn_about(axis: Tensor, angle: float) -> Tensor:
@@ -193,5 +196,9 @@ def scaled(length: float, generator: np.random.Generator, width: float) -> float
 
 def unit(direction: Vector, like: Tensor) -> Tensor:
     """A direction as a unit vector (3,) of the type of a tensor."""
-    vector = torch.as_tensor(direction).to(like)
-    return vector / vector.norm().clamp(min=1e-9)
+    return _normalised(torch.as_tensor(direction).to(like))
+
+
+def _normalised(vector: Tensor) -> Tensor:
+    length: Tensor = torch.linalg.vector_norm(vector)
+    return vector / length.clamp(min=1e-9)

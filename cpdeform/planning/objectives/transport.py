@@ -125,6 +125,11 @@ class ObjectiveTransport(Objective):
             grad_positions += contact_positions
         return ObjectiveResult(loss, grad_positions, grad_poses, warm=entries if self.warm_start else None)
 
+    def value(self, positions: Tensor) -> Tensor:
+        """Transport cost (scalar tensor) of positions (N, 3), length units, from scratch and without further terms."""
+        cost, _, _ = self._transport(positions.unsqueeze(0), None)
+        return cost[0]
+
     def _entries(self, warm: Sequence[object] | None, worlds: int) -> list[_Warm] | None:
         """The warm entries, checked; None for a start from scratch."""
         if warm is None or not self.warm_start:

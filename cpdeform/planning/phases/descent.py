@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 
 from cpdeform.core.objective import Objective
 from cpdeform.core.placer import Candidate
 from cpdeform.planning.optimizer import SEARCH, TrajectoryOptimizer
-from cpdeform.planning.phases.phase import Phase
+from cpdeform.planning.phases.phase import Phase, Scope
 from cpdeform.planning.workbench import Workbench
 
 REFINEMENT = "refinement"
@@ -27,7 +27,7 @@ class PhaseDescent(Phase):
         name: The phase's name.
     """
 
-    scope: ClassVar[Literal["round", "stage"]] = "round"
+    scope: ClassVar[Scope] = "round"
     optimizer: TrajectoryOptimizer
     objective: Objective | None = None
     name: str = SEARCH
@@ -55,7 +55,7 @@ class PhaseRefinement(Phase):
         name: The phase's name.
     """
 
-    scope: ClassVar[Literal["round", "stage"]] = "stage"
+    scope: ClassVar[Scope] = "plan"
     objective: Objective
     optimizer: TrajectoryOptimizer
     name: str = REFINEMENT

@@ -8,21 +8,24 @@ from typing import ClassVar, Literal
 from cpdeform.core.placer import Candidate
 from cpdeform.planning.workbench import Workbench
 
+Scope = Literal["round", "search", "plan"]
+
 
 class Phase(abc.ABC):
     """A step from proposals to the plan of a stage.
 
     A stage runs a list of phases. Those of the scope ``"round"`` work, one after the other, on all candidates of each round of
-    proposals. Those of the scope ``"stage"`` then work on the plan of the lowest loss, and what they find is executed in its place
-    where they accept it. To add a phase, write a subclass and put it into the list: `cpdeform.planning.strategy.Strategy.phases`.
+    proposals; those of the scope ``"search"`` on the candidates of all rounds, when the last one is over. The candidate of the
+    lowest loss is executed. Those of the scope ``"plan"`` then work on that plan, and what they find is executed in its place where
+    they accept it. To add a phase, write a subclass and put it into the list: `cpdeform.planning.strategy.Strategy.phases`.
 
     Attributes:
         name: Short name, told to observers with each iteration, and the key of its wall time.
-        scope: ``"round"`` or ``"stage"``.
+        scope: ``"round"``, ``"search"`` or ``"plan"``.
     """
 
     name: str
-    scope: ClassVar[Literal["round", "stage"]]
+    scope: ClassVar[Scope]
 
     @abc.abstractmethod
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
@@ -31,11 +34,11 @@ class Phase(abc.ABC):
         Args:
             bench: The stage, the simulator and the counters.
             candidates: Candidates of a round, fresh (`bench.first_actions` gives them actions) or as the phase before left them;
-                of the scope ``"stage"`` the single one that was executed.
+                of the scope ``"plan"`` the single one that was executed.
 
         Returns:
-            Of a round, the same candidates in the same order, with plans and losses; infinite losses mark those that the next
-            phases leave out. Of a stage, the changed candidate, or nothing where nothing was gained.
+            Of a round or a search, the same candidates in the same order, with plans and losses; infinite losses mark those that
+            the next phases leave out. Of a plan, the changed candidate, or nothing where nothing was gained.
         """
 
     def accepts(self, loss: float, *, loss_before: float, loss_now: float) -> bool:

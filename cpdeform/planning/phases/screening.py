@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 
@@ -11,7 +11,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.objective import Objective
 from cpdeform.core.placer import Candidate
 from cpdeform.planning.optimizer import TrajectoryOptimizer
-from cpdeform.planning.phases.phase import Phase
+from cpdeform.planning.phases.phase import Phase, Scope
 from cpdeform.planning.workbench import Workbench
 
 
@@ -32,7 +32,7 @@ class PhaseScreening(Phase):
         InputError: `keep` is below 1.
     """
 
-    scope: ClassVar[Literal["round", "stage"]] = "round"
+    scope: ClassVar[Scope] = "round"
     keep: int
     objective: Objective | None = None
     initial_noise: float = 0.01

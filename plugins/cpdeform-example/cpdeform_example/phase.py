@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 
 from cpdeform import Candidate, Phase
+from cpdeform.planning.phases.phase import Scope
 from cpdeform.planning.workbench import Workbench
 
 
@@ -21,7 +22,7 @@ class PhaseVariation(Phase):
         name: The phase's name.
     """
 
-    scope: ClassVar[Literal["round", "stage"]] = "stage"
+    scope: ClassVar[Scope] = "plan"
     count: int = 4
     noise: float = 0.05
     name: str = "variation"

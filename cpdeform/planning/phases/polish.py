@@ -1,0 +1,67 @@
+"""Polish: a few steps of descent for the best candidates of a whole search."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+import torch
+
+from cpdeform.core.errors import InputError
+from cpdeform.core.placer import Candidate
+from cpdeform.planning.optimizer import TrajectoryOptimizer
+from cpdeform.planning.phases.phase import Phase, Scope
+from cpdeform.planning.workbench import Workbench
+
+MOST_ALIKE = 2
+"""Candidates of one label around one contact particle that are taken, at most: the best of a search are often variations of one."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PhasePolish(Phase):
+    """Go on from the plans of the best candidates by gradient descent; the others stay as they are.
+
+    Attributes:
+        keep: Number of candidates that are polished.
+        optimizer: How.
+        name: The phase's name.
+
+    Raises:
+        InputError: `keep` is below 1.
+    """
+
+    scope: ClassVar[Scope] = "search"
+    keep: int
+    optimizer: TrajectoryOptimizer
+    name: str = "polish"
+
+    def __post_init__(self) -> None:
+        if self.keep < 1:
+            raise InputError("keep", came=str(self.keep), expected="at least 1")
+
+    def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
+        """All candidates, the best of them with better plans; a plan is never worse than before."""
+        chosen = self._best(candidates)
+        if not chosen:
+            return candidates
+        found = bench.minimize([candidates[number] for number in chosen], self.optimizer, None, phase=self.name)
+        result = list(candidates)
+        for number, loss, actions in zip(chosen, found.loss.tolist(), found.actions, strict=True):
+            if loss < candidates[number].loss:
+                result[number] = dataclasses.replace(candidates[number], loss=loss, actions=actions)
+        return result
+
+    def _best(self, candidates: list[Candidate]) -> list[int]:
+        """Numbers of the candidates to be polished, the best first."""
+        losses = torch.tensor([candidate.loss for candidate in candidates], dtype=torch.float64).nan_to_num(nan=torch.inf)
+        chosen: list[int] = []
+        alike: dict[tuple[str, int | None], int] = {}
+        for number in losses.argsort(stable=True).tolist():
+            if len(chosen) == self.keep or not bool(torch.isfinite(losses[number])):
+                break
+            proposal = candidates[number].proposal
+            family = (proposal.label, proposal.contact_particle)
+            alike[family] = alike.get(family, 0) + 1
+            if alike[family] <= MOST_ALIKE:
+                chosen.append(number)
+        return chosen

@@ -1,0 +1,91 @@
+"""Sculpting by many touches: drawn, screened by rollouts, varied, and the best of them polished by gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from cpdeform.core.errors import InputError
+from cpdeform.core.task import Task
+from cpdeform.planning.algorithm import Planner, Start
+from cpdeform.planning.optimizer import TrajectoryOptimizer
+from cpdeform.planning.phases.phase import Phase
+from cpdeform.planning.phases.polish import PhasePolish
+from cpdeform.planning.phases.screening import PhaseScreening
+from cpdeform.planning.pruner import PrunerNone
+from cpdeform.planning.rest import rest
+from cpdeform.planning.result import StageResult, Status
+from cpdeform.planning.strategy import Parts, Strategy
+
+SCREENED = 10_000
+"""Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
+
+
+class StrategySculpt(Strategy):
+    """Each stage is one touch, the best of many.
+
+    A stage draws random touches, judges each by one rollout, varies the best, and polishes the best of all by gradients, in two
+    steps. The loss is transport and misplaced mass. The clay is let to rest before the first touch. Where no touch gains, others
+    are drawn, a few times in a row.
+
+    Args:
+        touches: Random touches of a stage.
+        variations: Touches of each of two rounds of variations.
+        polished: Candidates of the first step of polishing, and of the second.
+        iterations: Gradient evaluations of each of them in these steps.
+        idle: Stages without a gain in a row after which the run ends.
+
+    Raises:
+        InputError: An option is out of range.
+    """
+
+    def __init__(
+        self,
+        *,
+        touches: int = 96,
+        variations: int = 32,
+        polished: tuple[int, int] = (5, 2),
+        iterations: tuple[int, int] = (4, 8),
+        idle: int = 3,
+    ) -> None:
+        numbers = {"touches": touches, "variations": variations, "idle": idle}
+        numbers |= {"polished": min(polished), "iterations": min(iterations)}
+        for name, number in numbers.items():
+            if number < 1:
+                raise InputError(name, came=str(number), expected="at least 1")
+        self.touches, self.variations, self.idle = touches, variations, idle
+        self.polished, self.iterations = tuple(polished), tuple(iterations)
+
+    def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
+        """The placer of touches, and the loss that sees crumbs."""
+        settings: dict[str, Any] = {"placer": "touch", "objective": {"kind": "shape", "points": 3000, "blur": 4e-3}}
+        if placer in (None, "touch"):
+            settings["placer_options"] = {"count": self.touches, "variations": self.variations}
+        return settings
+
+    def phases(self, parts: Parts) -> tuple[Phase, ...]:
+        """Screening of each round, then two steps of polishing of the best of all."""
+        rates = (0.15, 0.08)
+        steps = zip(self.polished, self.iterations, rates, strict=True)
+        optimizers = [
+            (keep, TrajectoryOptimizer(iterations=count, learning_rate=rate, pruner=PrunerNone(), backtrack=3))
+            for keep, count, rate in steps
+        ]
+        return (
+            PhaseScreening(keep=SCREENED),
+            *(PhasePolish(keep=keep, optimizer=optimizer) for keep, optimizer in optimizers),
+        )
+
+    def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
+        """One touch a stage, from rest; a few stages without a gain do not end the run."""
+        state = start.state if start.previous else rest(planner.simulator, start.state).state
+        results: list[StageResult] = []
+        warm, failures = None, 0
+        for index in range(start.first_stage, start.first_stage + start.stages):
+            result = planner.stage(start, index, state, results, warm=warm)
+            results.append(result)
+            yield result
+            failures = 0 if result.status is Status.FINISHED else failures + 1
+            if failures == self.idle or result.status is Status.NON_FINITE:
+                return
+            state, warm = result.state, result.warm
