@@ -86,6 +86,7 @@ def test_a_trajectory_goes_with_the_last_reference_to_it(backend: str, use: Call
     assert [name for name, reference in watched.items() if reference() is not None] == []
 
 
+@pytest.mark.filterwarnings("ignore:.*clay passes through tools:UserWarning")
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_long_search_keeps_no_trajectory(backend: str, tmp_path: Path) -> None:
     """However many iterations a run makes, at most the last trajectory is there when the next one is made."""

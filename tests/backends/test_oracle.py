@@ -164,4 +164,4 @@ def test_files_that_cannot_be_used_say_why(tmp_path: Path) -> None:
     errors = check_golden_file(changed_file(tmp_path, without_cells), warp)
     assert (errors.status, "grid_size" in errors.reason) == ("failed", True)
     errors = check_golden_file(changed_file(tmp_path, lambda arrays: arrays.pop("x0")), warp)
-    assert (errors.status, "no array 'x0'" in errors.reason) == ("failed", True)
+    assert (errors.status, 'no array "x0"' in errors.reason) == ("failed", True)

@@ -77,7 +77,7 @@ def test_the_record_says_where_it_came_from(half):
     assert load_record("half").run["resumed_from"] is None
     assert resume("--stages", 2, "--seed", 6).exit_code == 0
     record = load_record("rest")
-    names = {"backend": "toy", "ot": "toy", "placer": "toy"}
+    names = {"backend": "toy", "ot": "toy", "placer": "toy", "strategy": "cpdeform"}
     assert record.run["resumed_from"] == {"directory": "half", "status": "finished", "stages": 1, "names": names}
     configuration = record.run["configuration"]
     assert (configuration["task"], configuration["seed"], configuration["optimizer"]["iterations"]) == ("shift.yaml", 6, 3)
@@ -122,7 +122,7 @@ def test_options_go_with_their_part(directory):
 
 
 def test_a_run_made_in_python(directory):
-    parts = {"simulator": "toy", "ot_solver": "toy", "placer": "toy"}
+    parts = {"simulator": "toy", "ot_solver": "toy", "placer": "toy", "strategy": "cpdeform"}
     result = deform("shift.yaml", **parts, optimizer=TrajectoryOptimizer(iterations=3), stages=1, seed=4)
     result.save("half")
     finished = resume("--iterations", 2)

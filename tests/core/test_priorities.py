@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import pytest
@@ -42,20 +41,20 @@ def bent(points: Tensor) -> Tensor:
 def test_a_moved_cloud_is_displaced_by_its_shift(make: MakeSolver) -> None:
     points, shift = rod(), torch.tensor([0.03, 0.1, -0.02], dtype=torch.float64)
     result = make(blur=5e-3, exponent=2).solve(points, points + shift)
-    assert torch.allclose(transport_priorities(result, kind="displacement"), shift.norm().expand(len(points)), rtol=0.02)
+    assert torch.allclose(transport_priorities(result), shift.norm().expand(len(points)), rtol=0.02)
     assert torch.allclose(transport_displacements(result), shift.expand(len(points), 3), atol=2e-3)
 
 
 def test_displacement_is_zero_where_the_clay_stays(make: MakeSolver) -> None:
     points = rod()
-    displacement = transport_priorities(make(blur=5e-3, exponent=2).solve(points, points.clone()), kind="displacement")
+    displacement = transport_priorities(make(blur=5e-3, exponent=2).solve(points, points.clone()))
     assert float(displacement.max()) < 1e-4
 
 
 def test_displacement_finds_the_fault_where_the_potential_finds_the_other_end(make: MakeSolver) -> None:
     points = rod()
     moved = (bent(points) - points).norm(dim=1)
-    displacement = transport_priorities(make(blur=5e-3, exponent=2).solve(points, bent(points)), kind="displacement")
+    displacement = transport_priorities(make(blur=5e-3, exponent=2).solve(points, bent(points)))
     away = (points[:, 0] - 0.345).abs() > 0.05  # at the bend the best matching is another one
     assert torch.allclose(displacement[away], moved[away], atol=0.01)
     assert float(points[displacement.argmax(), 0]) < 0.4
@@ -67,8 +66,4 @@ def test_displacement_finds_the_fault_where_the_potential_finds_the_other_end(ma
 def test_displacement_needs_the_squared_distance() -> None:
     result = OTSolverPOT(blur=0.01).solve(rod()[::20], bent(rod())[::20])
     with pytest.raises(InputError, match=r"result: got a solution of the cost \|x - y\|\^1, .* Give the solver exponent=2"):
-        transport_priorities(result, kind="displacement")
-    with pytest.raises(InputError, match="result: got a solution"):
         transport_displacements(result)
-    with pytest.raises(InputError, match='kind: got "distance"'):
-        transport_priorities(dataclasses.replace(result, exponent=2), kind="distance")  # type: ignore[arg-type]

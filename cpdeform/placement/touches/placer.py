@@ -14,6 +14,7 @@ from cpdeform.core.placer import Candidate, Placer, PlacerCapabilities, Proposal
 from cpdeform.core.priorities import DISPLACEMENT_EXPONENT
 from cpdeform.core.scene import Manipulator, ManipulatorRollingPin, Scene
 from cpdeform.placement.grid import movable_manipulators
+from cpdeform.placement.tool import surface_points
 from cpdeform.placement.touches.draw import LONGEST_WAY, TouchDraw
 from cpdeform.placement.touches.together import label
 from cpdeform.placement.touches.touch import Room, Touch
@@ -177,6 +178,7 @@ def _begin(stage: Stage) -> _Search:
         particles=particles,
         poses=_out_of_the_way(stage, movable),
         floor=float(particles[:, 1].min()),
+        surfaces=tuple(surface_points(tool).to(particles) for tool in stage.scene.manipulators),
     )
     seed = int(torch.randint(2**31, (1,), generator=stage.generator))
     edge = _clay_volume(stage.scene) ** (1.0 / 3.0)
