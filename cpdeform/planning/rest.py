@@ -136,7 +136,8 @@ def rest(
             still = damping if not relaxations[world].rests else torch.ones_like(damping)
             current.velocity[world] = torch.where(still[:, None], 0.0, after.velocity[row])
             current.affine[world] = torch.where(still[:, None, None], 0.0, after.affine[row])
-        active = [world for world in active if not relaxations[world].rests]
+        # A world that has left the finite numbers cannot go on, and does not rest.
+        active = [world for world in active if not relaxations[world].rests and _is_finite(current, world)]
         if not active:
             break
     return Rest(
@@ -146,6 +147,11 @@ def rest(
         residual=tuple(item.residual for item in relaxations),
         moving_share=tuple(item.moving_share for item in relaxations),
     )
+
+
+def _is_finite(state: State, world: int) -> bool:
+    tensors = (state.position, state.velocity, state.affine, state.elastic_strain)
+    return all(bool(torch.isfinite(tensor[world]).all()) for tensor in tensors)
 
 
 class _Relaxation:

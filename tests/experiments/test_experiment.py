@@ -124,11 +124,11 @@ def test_finished_records_are_read(copied, no_runs):
 def test_another_configuration_runs_again(copied):
     assert run_toy("--out", "out").exit_code == 0
     assert [row["reused"] for row in table()] == ["True"]
-    for change in (["--set", "optimizer.learning_rate=0.2"], ["--particles", "30"], ["--no-resume"]):
+    for change in (["--set", "optimizer.learning_rate=0.15"], ["--particles", "30"], ["--no-resume"]):
         assert run_toy("--out", "out", *change).exit_code == 0
         assert [row["reused"] for row in table()] == ["False"]
     record = load_record("out/shift/fixed-seed0")
-    assert record.run["configuration"]["optimizer"]["learning_rate"] == 0.1
+    assert record.run["configuration"]["optimizer"]["learning_rate"] == 0.2
     moved = np.load("target.npz")["position"] + [0.0, 0.01, 0.0]
     np.savez("target.npz", position=moved)
     assert run_toy("--out", "out").exit_code == 0

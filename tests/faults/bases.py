@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from toy_fixtures import write_toy_task
 
-from cpdeform.core.plugins import load_registry
+from cpdeform.core.plugins import Registry, load_registry
 from cpdeform.core.target import write_target
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.run.configuration import RunConfiguration
@@ -25,13 +25,19 @@ SCENE = {
 }
 
 
+def registry_with_toys() -> Registry:
+    """The installed plugins, and the toys that the record is made with."""
+    toys = importlib.metadata.EntryPoint("toy", "cpdeform_toy.plugin", "cpdeform")
+    return load_registry([*importlib.metadata.entry_points(group="cpdeform"), toys])
+
+
 def make_bases(directory: Path) -> Path:
     """Goals, grids, a task, a run record and a recording of PlasticineLab's form."""
     generator = np.random.default_rng(0)
     (directory / "task").mkdir(parents=True)
-    settings = {"optimizer": {"iterations": 3}, "placer_options": {}, "scene": {"manipulators": {"0": {"friction": 0.5}}}}
+    limits = {"manipulators": {"0": {"friction": 0.5, "lower_bound": [0.0, 0.01, 0.0]}}}
     variants = {"v1": {"step_count": 4}, "v2": {"scene": {"bodies": {"0": {"radius": 0.05}}}}}
-    task = write_toy_task(directory / "task", scene=SCENE, settings=settings, variants=variants, rest_steps=1)
+    task = write_toy_task(directory / "task", scene=SCENE, limits=limits, variants=variants, rest_steps=1)
     positions = generator.uniform(0.3, 0.6, (200, 3))
     grid = np.zeros((GRID_SIZE,) * 3)
     grid[5:9, 5:9, 5:9] = generator.uniform(0.1, 1.0, (4, 4, 4))
@@ -52,8 +58,7 @@ def make_bases(directory: Path) -> Path:
 
 def _make_record(directory: Path, task: Path) -> None:
     parts = {"simulator": "toy", "ot_solver": "toy", "placer": "toy"}
-    registry = load_registry([importlib.metadata.EntryPoint("toy", "cpdeform_toy.plugin", "cpdeform")])
-    result = deform(str(task), optimizer=TrajectoryOptimizer(iterations=2), registry=registry, **parts)
+    result = deform(str(task), optimizer=TrajectoryOptimizer(iterations=2), registry=registry_with_toys(), **parts)
     configuration = RunConfiguration(task=str(task), backend="toy", ot="toy", placer="toy")
     save_result(result, directory / "record", configuration=configuration)
 

@@ -21,17 +21,15 @@ from typing import Any
 import damage
 import numpy as np
 import yaml
-from bases import make_bases
+from bases import make_bases, registry_with_toys
 
-from cpdeform.cli.run import _configure
+from cpdeform.cli.run import resolve_command
 from cpdeform.core.errors import MESSAGE_LENGTH, CpdeformError, InputError
-from cpdeform.core.plugins import load_registry
 from cpdeform.core.target import load_correspondence, load_target, load_target_grid
 from cpdeform.core.task import list_variants, read_task
-from cpdeform.run.configuration import RunConfiguration, with_task_settings
-from cpdeform.run.deform import configured_task
+from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record import load_record
-from cpdeform.run.resume import make_resumption, resumed_values
+from cpdeform.run.resolve import resolve
 from cpdeform.tasks import grid_import
 from cpdeform.testing.golden_file import read_golden
 
@@ -54,7 +52,7 @@ class Campaign:
     def __init__(self, directory: Path, choice: random.Random) -> None:
         self.choice = choice
         self.bases = directory / "bases"
-        self.registry = load_registry()
+        self.registry = registry_with_toys()
         self.place = directory / "case"
 
     def _copy(self, name: str) -> Path:
@@ -125,13 +123,12 @@ class Campaign:
         else:
             path.write_bytes(damage.change_bytes(path.read_bytes(), self.choice))
         record = load_record(directory)
-        configuration = RunConfiguration.model_validate(resumed_values(record, {}))
-        resumption = make_resumption(record, configuration)
+        resumed = resolve({}, record=record, registry=self.registry)
         each(
             (
-                resumption.task.load_target,
-                resumption.task.load_target_grid,
-                resumption.task.target_corresponds,
+                resumed.task.load_target,
+                resumed.task.load_target_grid,
+                resumed.task.target_corresponds,
                 lambda: record.state,
             )
         )
@@ -166,8 +163,7 @@ class Campaign:
             path.write_bytes(damage.change_bytes(path.read_bytes(), self.choice))
         each((lambda: list_variants(path),))
         task = read_task(path)
-        with_task_settings(RunConfiguration(), task)
-        configured_task(RunConfiguration(task=str(path)), registry=self.registry)
+        resolve({"task": str(path)}, registry=self.registry)
         each((task.load_target, task.load_target_grid, task.target_corresponds))
 
     def setting(self) -> None:
@@ -181,8 +177,7 @@ class Campaign:
             )
         text = damage.bomb(self.choice) if self.choice.random() < 0.1 else damage.text_of(damage.value(self.choice), self.choice)
         setting = ".".join(place) + ("=" if self.choice.random() < 0.98 else "") + text
-        configuration = _configure({"task": str(task)} if place[0] != "task" else {}, [setting])
-        changed = configured_task(configuration, registry=self.registry)
+        changed = resolve_command({"task": str(task)} if place[0] != "task" else {}, [setting]).task
         each((changed.load_target, changed.load_target_grid))
 
 

@@ -161,7 +161,7 @@ def test_pushes_stand_beside_other_candidates() -> None:
 def test_pushes_need_displacements() -> None:
     stage = rope([ball()])
     stage = dataclasses.replace(stage, transport=transport_of(stage.priorities))
-    with pytest.raises(InputError, match=r"a solution of the cost \|x - y\|\^1, .* --set priorities.kind=displacement"):
+    with pytest.raises(InputError, match=r"a solution of the cost \|x - y\|\^1, .*\(--set priorities\.kind=displacement\)"):
         PlacerTransport(proposers=["push"]).ask(stage)
 
 

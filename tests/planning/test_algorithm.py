@@ -233,7 +233,7 @@ def test_capabilities_are_checked_before_any_work(task):
     for made, error, message in cases:
         with pytest.raises(error, match=message):
             made.run()
-    with pytest.raises(InputError, match="stages: got 0, expected at least 1"):
+    with pytest.raises(InputError, match="stages: got 0, expected a whole number, at least 1"):
         planner(task, observers=(diary,)).run(stages=0)
     assert diary.entries == []
 
