@@ -155,7 +155,8 @@ def place(touch: Touch, room: Room, *, steps: int) -> tuple[Tensor, Tensor] | No
             actions[:going, offset : offset + 3] = command
             actions[going:, offset : offset + 3] = -BACK_SPEED * command
         offset += tool.action_size
-    return poses, actions
+    # A tool that cannot go where the touch would have it makes none.
+    return (poses, actions) if bool(actions.any()) else None
 
 
 def _command(tool: Manipulator, step: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ class ObjectiveShape(Objective):
     ) -> None:
         if not 0.0 <= density_weight < float("inf"):
             raise InputError("density_weight", came=str(density_weight), expected="a finite number of at least 0")
-        self._transport, self._weight = transport, density_weight
+        self._transport, self._weight, self._scene = transport, density_weight, scene
         self._scenes = [scene.model_copy(update={"grid_size": nodes}) for nodes in SCALES]
         self._goals = [_shares(target.detach(), scale) for scale in self._scenes]
         cost = float(transport.value(start.detach()))
@@ -49,6 +49,11 @@ class ObjectiveShape(Objective):
         self._cost_start = cost
         if not (cost > 0.0 and self._misplaced_start > 0.0):
             raise InputError("start", came="the goal itself", expected="a shape that differs from the goal")
+
+    def rebased(self, *, target: Tensor, start: Tensor) -> ObjectiveShape:
+        """The same objective for another goal (M, 3) and another start (N, 3), length units, such as those at rest."""
+        transport = self._transport.with_target(target.to(self._transport.target))
+        return ObjectiveShape(transport, self._scene, target, start, density_weight=self._weight)
 
     def evaluate(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> ObjectiveResult:
         """Loss and gradient of each world; the transport term is warm-started."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Sequence
 
@@ -124,6 +125,12 @@ class ObjectiveTransport(Objective):
             loss = loss + contact
             grad_positions += contact_positions
         return ObjectiveResult(loss, grad_positions, grad_poses, warm=entries if self.warm_start else None)
+
+    def with_target(self, target: Tensor) -> ObjectiveTransport:
+        """The same objective for other goal particles (M, 3), length units."""
+        changed = copy.copy(self)
+        changed.target = target.detach()
+        return changed
 
     def value(self, positions: Tensor) -> Tensor:
         """Transport cost (scalar tensor) of positions (N, 3), length units, from scratch and without further terms."""

@@ -6,27 +6,26 @@ from collections.abc import Mapping
 from typing import Any
 
 from cpdeform.core.task import Task
-from cpdeform.planning.strategies.budget import search_settings
+from cpdeform.planning.strategies.budget import LONG_STAGE, search_settings
 from cpdeform.planning.strategy import Strategy
 
-SEVERAL_ROUNDS, FEW_ROUNDS = 4, 2
-"""Rounds of candidates of a stage where others follow, and of one that is the only one."""
+ROUNDS, LONG_ROUNDS = 4, 2
+"""Rounds of candidates of a stage, and of one that is long and the only one."""
 
 
 class StrategyCpdeform(Strategy):
     """Algorithm 1 with candidates that race each other and come back from dead ends; budget and step size follow from the task.
 
-    A task of a single stage also tries its tools from where they are: a scene may have them in place.
+    A task of a single long stage also tries its tools from where they are: a scene may have them in place.
     """
 
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
         """Settings that follow from the task's schedule, its tools' speed and their number."""
         settings = search_settings(task)
         if (placer or "transport") == "transport":
-            several = task.stage_count > 1
-            settings["placer_options"] = {"rounds": SEVERAL_ROUNDS if several else FEW_ROUNDS}
-            if not several:
-                settings["placer_options"]["proposers"] = ["current", *_proposers(task)]
+            settings["placer_options"] = {"rounds": ROUNDS}
+            if task.stage_count == 1 and task.step_count >= LONG_STAGE:
+                settings["placer_options"] = {"rounds": LONG_ROUNDS, "proposers": ["current", *_proposers(task)]}
         return settings
 
 

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from torch import Tensor
+
 from cpdeform.core.errors import InputError
+from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
+from cpdeform.planning.objectives.shape import ObjectiveShape
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.phase import Phase
 from cpdeform.planning.phases.polish import PhasePolish
 from cpdeform.planning.phases.screening import PhaseScreening
 from cpdeform.planning.pruner import PrunerNone
-from cpdeform.planning.rest import rest
+from cpdeform.planning.rest import rest, settle_goal
 from cpdeform.planning.result import StageResult, Status
 from cpdeform.planning.strategy import Parts, Strategy
+
+MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
+"""How far a goal may fall and how much of its shape it has to keep to count as one at rest that hangs a little."""
 
 SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
@@ -77,10 +85,10 @@ class StrategySculpt(Strategy):
         )
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
-        """One touch a stage, from rest; a few stages without a gain do not end the run."""
-        state = start.state if start.previous else rest(planner.simulator, start.state).state
+        """One touch a stage, from rest to rest; a few stages without a gain do not end the run."""
+        planner, start = from_rest(planner, start)
         results: list[StageResult] = []
-        warm, failures = None, 0
+        state, warm, failures = start.state, None, 0
         for index in range(start.first_stage, start.first_stage + start.stages):
             result = planner.stage(start, index, state, results, warm=warm)
             results.append(result)
@@ -89,3 +97,35 @@ class StrategySculpt(Strategy):
             if failures == self.idle or result.status is Status.NON_FINITE:
                 return
             state, warm = result.state, result.warm
+
+
+def from_rest(planner: Planner, start: Start) -> tuple[Planner, Start]:
+    """A run whose clay has come to rest before the first stage, and whose goal lies where clay of its shape rests.
+
+    The loss is measured from there. Without it the first stages would be paid for falling, and the goal could not be met.
+
+    Args:
+        planner: The parts.
+        start: Where the run would begin.
+
+    Returns:
+        Planner and start, changed. A goal that clay does not keep, such as one in the air, stays where it is, as does the state of
+        a run that goes on.
+    """
+    simulator = planner.simulator
+    first = rest(simulator, simulator.initial_state(batch_size=1)).state
+    target = _settled(simulator, start.target)
+    objective = planner.objective
+    if isinstance(objective, ObjectiveShape):
+        objective = objective.rebased(target=target, start=first.position[0])
+    state = start.state if start.previous or start.first_stage else first
+    return dataclasses.replace(planner, objective=objective), dataclasses.replace(start, state=state, target=target)
+
+
+def _settled(simulator: Simulator, target: Tensor) -> Tensor:
+    """The goal's particles (M, 3) where clay of its shape rests."""
+    if len(target) != simulator.scene.particle_count:
+        return target
+    settled = settle_goal(simulator, target)
+    near = 0.0 <= settled.drop <= MOST_CELLS / simulator.scene.grid_size
+    return settled.position.to(target) if near and settled.self_iou >= LEAST_SELF_IOU else target
