@@ -18,6 +18,7 @@ from cpdeform.placement.tool import tool_half_extents
 from cpdeform.placement.transport import PlacerTransport
 from cpdeform.report.render import fit_camera, render
 from cpdeform.report.shapes import tool_surface
+from cpdeform.testing.placer import transport_of
 
 CONE = ManipulatorCone(position=(0.5, 0.4, 0.5), radius=0.05, height=0.12, action_scale=(0.01, 0.01, 0.01))
 BODY = {"kind": "box", "position": (0.5, 0.1, 0.5), "widths": (0.2, 0.1, 0.2), "particle_count": 500}
@@ -40,7 +41,7 @@ def test_a_placer_puts_it_onto_the_body() -> None:
     scene = make_scene()
     state = initial_state(scene, dtype=torch.float64)
     priorities = -(state.position[0] - torch.tensor([0.5, 0.15, 0.5])).norm(dim=-1)
-    stage = Stage(0, scene, state, state.position[0], priorities, torch.Generator().manual_seed(0))
+    stage = Stage(0, scene, state, state.position[0], transport_of(priorities), torch.Generator().manual_seed(0))
     (placement, *_) = PlacerTransport().ask(stage)
     gap = signed_distance(CONE, placement.pose[0], state.position[0]).min()
     assert 0.0 <= float(gap) <= 6e-4

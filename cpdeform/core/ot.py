@@ -191,7 +191,7 @@ def check_blur(blur: float, source: Tensor, target: Tensor) -> None:
     """
     low = torch.minimum(source.amin(dim=0), target.amin(dim=0)).double()
     high = torch.maximum(source.amax(dim=0), target.amax(dim=0)).double()
-    span = float((high - low).norm())
+    span = float((high - low).detach().norm())
     if not blur >= LEAST_RELATIVE_BLUR * span:
         raise InputError(
             "blur",

@@ -10,9 +10,9 @@ from torch import Tensor
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import RolloutGradient, Trajectory, differentiable_rollout
 from cpdeform.core.state import State
-from cpdeform.testing.report import CheckItem, Finding, worst
+from cpdeform.testing.report import CheckItem, Finding, Skip, worst
 from cpdeform.testing.simulator_bench import SimulatorBench, largest_difference, noise_like, random_actions, stirred
-from cpdeform.testing.simulator_gradient import DOUBLE_BOUND, SINGLE_BOUND, Probe
+from cpdeform.testing.simulator_gradient import DOUBLE_BOUND, Probe
 
 INPUTS = {
     "position": "velocity",
@@ -50,11 +50,13 @@ class _FinalProbe(Probe):
 def check_final_gradients(bench: SimulatorBench) -> Finding:
     """Gradients of every tensor of the final state."""
     bench.require_gradient()
+    if not bench.double:
+        raise Skip("differences of final velocities are too coarse in single precision; the check of chained rollouts tells")
     figures = {}
     for field, name in INPUTS.items():
         if name != "actions" or bench.scene.action_size:
             figures[f"final {field} by {name}"] = _FinalProbe(bench, bench.scene, field).error(name)
-    return worst(figures, bench.bound(DOUBLE_BOUND, SINGLE_BOUND))
+    return worst(figures, DOUBLE_BOUND)
 
 
 def check_chain(bench: SimulatorBench) -> Finding:

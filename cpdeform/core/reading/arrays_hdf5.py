@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.reading.arrays import ArrayFile, Container, Header
+from cpdeform.core.reading.array_file import ArrayFile, Container, Header
 from cpdeform.core.reading.boundary import boundary
 from cpdeform.core.reading.limits import MEBIBYTE, ReadingLimits
 

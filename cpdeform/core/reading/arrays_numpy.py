@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.reading.arrays import Container, Header
+from cpdeform.core.reading.array_file import Container, Header
 from cpdeform.core.reading.limits import ReadingLimits
 
 _METHODS = {zipfile.ZIP_STORED: "stored", zipfile.ZIP_DEFLATED: "deflated"}
