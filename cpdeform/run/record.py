@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import errno
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,7 +39,7 @@ from cpdeform.run.record_files import (
     check_directory,
     environment,
     own_files,
-    replacing,
+    replacing_hdf5,
     stage_file,
     to_json,
     write_dataset,
@@ -51,6 +52,9 @@ __all__ = ["RunRecord", "RunRecorder", "load_record", "save_result"]
 
 FORMAT = 2
 """Version of the record's layout."""
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FULL_REMEDY = "Free some space, or choose another directory (--out); the finished stages are kept, and --resume goes on from them."
 
 
 class RunRecorder(Observer):
@@ -112,7 +116,7 @@ class RunRecorder(Observer):
                 # The goal is the copy beside this file.
                 "task": {**task.model_dump(mode="json"), "target": TARGET_FILE},
             }
-            with replacing(self.directory / TARGET_FILE) as temporary, h5py.File(temporary, "w") as file:
+            with replacing_hdf5(self.directory / TARGET_FILE) as file:
                 write_dataset(file, "position", target, shape="particle, xyz", units="length (domain edge = 1)")
                 _write_goal_extras(file, task)
             (self.directory / METRICS_FILE).write_text("", encoding="utf-8")
@@ -218,7 +222,8 @@ class RunRecorder(Observer):
         try:
             yield
         except OSError as error:
-            raise RecordError(f"cannot write the run record in {self.directory}: {error.strerror or error}.") from error
+            text = f"cannot write the run record in {self.directory}: {error.strerror or error}."
+            raise RecordError(f"{text} {FULL_REMEDY}" if error.errno in FULL else text) from error
 
 
 def _write_goal_extras(file: h5py.File, task: Task) -> None:

@@ -108,6 +108,20 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
+@contextlib.contextmanager
+def replacing_hdf5(path: Path) -> Iterator[h5py.File]:
+    """Give an HDF5 file in memory; what it holds at the end takes the place of `path`, in one step.
+
+    HDF5 itself never writes to the disk: where that is full, its library cannot close the file, and ends the process.
+    """
+    with h5py.File(path, "w", driver="core", backing_store=False) as file:
+        yield file
+        file.flush()
+        image = file.id.get_file_image()
+    with replacing(path) as temporary:
+        temporary.write_bytes(image)
+
+
 def to_json(value: Any) -> Any:
     """Replace tensors by lists and numbers that are not finite, which JSON cannot hold, by null."""
     if isinstance(value, Tensor):

@@ -18,7 +18,7 @@ from cpdeform.core.reading.json_text import parse_json
 from cpdeform.core.reading.limits import ReadingLimits
 from cpdeform.core.state import State
 from cpdeform.planning.result import StageResult, Status
-from cpdeform.run.record_files import replacing, to_json, write_dataset
+from cpdeform.run.record_files import replacing_hdf5, to_json, write_dataset
 
 MARGIN = 1e-3
 """How far outside of the domain a recorded position may lie for its rounding, length units."""
@@ -36,7 +36,7 @@ STATE_FIELDS = {
 
 def write_stage(path: Path, result: StageResult) -> None:
     """Write a stage atomically."""
-    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with replacing_hdf5(path) as file:
         file.attrs["index"] = result.index
         file.attrs["status"] = result.status.value
         file.attrs["best"] = -1 if result.best is None else result.best

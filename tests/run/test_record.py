@@ -296,7 +296,8 @@ class Slow(SimulatorToy):
         return super().rollout(state, actions)
 
 task = load_task({task!r})
-registry = load_registry([importlib.metadata.EntryPoint("toy", "cpdeform_toy.plugin", "cpdeform")])
+modules = {{"toy": "cpdeform_toy.plugin", "strategies": "cpdeform.planning.plugin"}}
+registry = load_registry([importlib.metadata.EntryPoint(name, module, "cpdeform") for name, module in modules.items()])
 deform(task, simulator=Slow(task.scene, batch_size=4), ot_solver="toy", placer="toy", stages=2, registry=registry,
        optimizer=TrajectoryOptimizer(iterations=100000, patience=20), observers=[RunRecorder({out!r})])
 """
