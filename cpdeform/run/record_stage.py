@@ -181,7 +181,7 @@ def _check_stage(stage: StageResult, argument: str) -> None:
     if stage.best is not None and stage.best >= len(stage.candidates):
         raise InputError(f"{argument}: best", came=str(stage.best), expected=f"one of {len(stage.candidates)} candidates")
     plan = (stage.actions, stage.positions, stage.manipulator_poses)
-    if stage.status is Status.FINISHED and any(part is None for part in plan):
+    if stage.status.executed and any(part is None for part in plan):
         raise InputError(
             argument, came="a finished stage without a plan", expected="actions, positions, manipulator_poses and best"
         )
