@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cpdeform.cli.bench_output import check_device, split_names, split_numbers
+from cpdeform.cli.interruption import exit_code
 from cpdeform.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -128,7 +129,7 @@ def _collect(name: str, rows: list[ExperimentRow], source: Iterator[ExperimentRo
     except KeyboardInterrupt as error:
         left = f"{out / 'table.md'} holds the {len(rows)} runs that are done" if rows else "no run was done"
         typer.echo(f"cpdeform: interrupted; {left}; the same command goes on from here", err=True)
-        raise typer.Exit(130) from error
+        raise typer.Exit(exit_code(error)) from error
 
 
 def _recorded(name: str, given: dict[str, Any], *, resume: bool) -> tuple[Iterator[ExperimentRow], int, dict[str, Any]]:

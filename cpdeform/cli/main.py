@@ -14,6 +14,7 @@ from cpdeform.cli.bench import bench
 from cpdeform.cli.check import check
 from cpdeform.cli.evaluate import evaluate
 from cpdeform.cli.experiment import experiment
+from cpdeform.cli.interruption import exit_code, interruptible
 from cpdeform.cli.plugins import plugins
 from cpdeform.cli.run import run
 from cpdeform.cli.strategies import strategies
@@ -49,7 +50,7 @@ class ErrorGroup(TyperGroup):
             raise typer.Exit(2) from error
         except KeyboardInterrupt as error:
             typer.echo("cpdeform: interrupted", err=True)
-            raise typer.Exit(130) from error
+            raise typer.Exit(exit_code(error)) from error
 
 
 def _show_warning(
@@ -93,8 +94,13 @@ def callback(
 
 
 def main() -> None:
-    """Entry point of the command line; exits with 0, 1 (a run without result), 2 (unusable input) or 130 (interrupted)."""
-    app(prog_name="cpdeform")
+    """Entry point of the command line.
+
+    It exits with 0, 1 (a run without result), 2 (unusable input), or where it was interrupted 130 (control-C), 143 (SIGTERM) or
+    129 (SIGHUP).
+    """
+    with interruptible():
+        app(prog_name="cpdeform")
 
 
 if __name__ == "__main__":

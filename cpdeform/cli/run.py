@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cpdeform.cli.interruption import exit_code
+
 if TYPE_CHECKING:
     from cpdeform.planning.result import DeformResult, Observer
     from cpdeform.run.record import RunRecorder
@@ -75,7 +77,8 @@ def run(
 
     With --resume, TASK may be left out, and --stages counts further stages (those left of the recorded run, or else one).
 
-    Exit code 0: a plan was found; 1: none was (the advice says what to try); 2: unusable input; 130: interrupted.
+    Exit code 0: a plan was found; 1: none was (the advice says what to try); 2: unusable input; 130, 143, 129: interrupted
+    by control-C, SIGTERM, SIGHUP.
     """
     flags = (task, backend, ot, placer, strategy, device, seed, stages, steps, target, iterations)
     given = {field: value for field, value in zip(FLAGS, flags, strict=True) if value is not None}
@@ -151,7 +154,7 @@ def _execute(resolved: ResolvedRun, out: Path | None, *, overwrite: bool, silent
             result = resolved.run([recorder, *observers])
     except KeyboardInterrupt as error:
         typer.echo(_interruption(recorder), err=True)
-        raise typer.Exit(130) from error
+        raise typer.Exit(exit_code(error)) from error
     return result, recorder.directory
 
 
@@ -170,7 +173,10 @@ def _print_configuration(resolved: ResolvedRun, *, as_json: bool) -> None:
 def _interruption(recorder: RunRecorder) -> str:
     if not recorder.started:
         return "cpdeform: interrupted before the run began; nothing was written"
-    return f"cpdeform: interrupted; the finished stages are recorded in {recorder.directory}"
+    text = f"cpdeform: interrupted; the finished stages are recorded in {recorder.directory}"
+    if recorder.rescued:
+        text += ", and so is the best plan so far of the stage that was interrupted"
+    return f"{text}; go on with: cpdeform run --resume {recorder.directory}" if recorder.stages else text
 
 
 def _default_directory(task: str) -> Path:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numbers
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, Strict, StringConstraints
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, StringConstraints
 
 MOST_PARTICLES = 10_000_000
 """Particles of a scene, or of a goal that is made, at most."""
@@ -61,5 +61,18 @@ Length = Annotated[Real, Field(ge=1e-6, le=1000.0)]
 """A size, length units (the domain's edge is 1)."""
 
 Lengths3 = tuple[Length, Length, Length]
-Name = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^[^/\\\x00-\x1f\x7f]+$")]
+
+
+def _no_place(name: str) -> str:
+    """Refuse the names that stand for the directory itself and the one above it."""
+    if name in (".", ".."):
+        raise ValueError("a name that a directory can have")
+    return name
+
+
+Name = Annotated[
+    str,
+    StringConstraints(min_length=1, max_length=100, pattern=r"^[^/\\\x00-\x1f\x7f]+$"),
+    AfterValidator(_no_place),
+]
 """A name that a directory is called after."""

@@ -22,11 +22,12 @@ from cpdeform.core.memory_limit import check_memory
 from cpdeform.core.objective import Objective
 from cpdeform.core.ot import OTSolver, TransportProblem
 from cpdeform.core.placer import LEAST_GAIN, Candidate, Placer, Stage
-from cpdeform.core.simulator import Simulator, Trajectory
+from cpdeform.core.simulator import Simulator
 from cpdeform.core.state import State
 from cpdeform.core.task import Task
 from cpdeform.planning.checks import check_parts, check_run, check_start, check_tools_outside
 from cpdeform.planning.executor import Executor, ExecutorSerial
+from cpdeform.planning.interrupted import Execution, StageInterrupted, best_so_far
 from cpdeform.planning.metrics import evaluate_metric
 from cpdeform.planning.optimizer import Iteration
 from cpdeform.planning.phases.phase import Phase
@@ -170,15 +171,28 @@ class Planner:
             state: State S_i, a single world.
             before: All stages that led here, the oldest first.
             warm: What the objective can start from, of the stage before (`StageResult.warm`).
+
+        Raises:
+            StageInterrupted: A `KeyboardInterrupt` came when a plan had been found; it holds the stage with the best one so far.
         """
         bench = self._workbench(start, index, state, before, warm)
-        candidates = self._search(bench)
-        for phase in self._phases("search"):
-            candidates = phase.run(bench, candidates)
-            bench.lap(phase.name)
+        execution = Execution(bench.stage.loss, bench.warm)
+        try:
+            candidates = self._search(bench)
+            for phase in self._phases("search"):
+                candidates = phase.run(bench, candidates)
+                bench.lap(phase.name)
+            return self._plan(bench, candidates, execution)
+        except KeyboardInterrupt as interruption:
+            best = best_so_far(bench, self.phases, execution, self._execute)
+            if best is None:
+                raise
+            raise StageInterrupted(_stage_result(bench, *best, Status.INTERRUPTED, execution)) from interruption
+
+    def _plan(self, bench: Workbench, candidates: list[Candidate], execution: Execution) -> StageResult:
+        """Execute the best candidate of a stage, and let further phases work on it."""
         # "execute the plan with the lowest loss"
         best = min(range(len(candidates)), key=lambda number: candidates[number].loss, default=None)
-        execution = _Execution(bench.stage.loss, bench.warm)
         status = _search_status(candidates, best, bench.stage.loss)
         if best is not None and status is Status.FINISHED:
             status = self._execute(bench, self._phases("round", "search")[-1], candidates[best], execution)
@@ -256,23 +270,22 @@ class Planner:
 
     def _search(self, bench: Workbench) -> list[Candidate]:
         """All candidates of a stage, round by round."""
-        candidates: list[Candidate] = []
         while True:
             # "p = particle with the largest priority; place the tools around p: best score, no collision with the body"
             proposals = self.placer.ask(bench.stage)
             bench.lap("placement")
             if not proposals:
-                return candidates
+                return bench.candidates
             # "for each candidate pose in T: actions, loss = minimise the shape loss through the simulator"
             found = [Candidate(proposal, float("nan"), proposal.pose.new_empty(0)) for proposal in proposals]
             for phase in self._phases("round"):
                 found = phase.run(bench, found)
-            candidates += found
+            bench.keep(found)
             bench.lap("optimization")
             if not self.placer.tell(found):
-                return candidates
+                return bench.candidates
 
-    def _execute(self, bench: Workbench, phase: Phase, candidate: Candidate, execution: _Execution) -> Status:
+    def _execute(self, bench: Workbench, phase: Phase, candidate: Candidate, execution: Execution) -> Status:
         """Execute a plan and keep what came of it, if its phase accepts that."""
         trajectory, loss, warm = bench.execute(candidate)
         if not np.isfinite(loss):
@@ -305,13 +318,17 @@ def contact_points_discovery(planner: Planner, start: Start) -> Iterator[StageRe
         start: Where to begin.
 
     Returns:
-        The result of each stage, as soon as it is known.
+        The result of each stage, as soon as it is known; that of an interrupted one before the interruption goes on.
     """
     results: list[StageResult] = []
     state, warm = start.state, None
     # "for each stage:"
     for index in range(start.first_stage, start.first_stage + start.stages):
-        result = planner.stage(start, index, state, results, warm=warm)
+        try:
+            result = planner.stage(start, index, state, results, warm=warm)
+        except StageInterrupted as interruption:
+            yield interruption.result
+            raise
         results.append(result)
         yield result
         if result.status is not Status.FINISHED:
@@ -327,24 +344,19 @@ def stage_generator(seed: int, index: int) -> torch.Generator:
 
 
 def failed_contacts(stages: Sequence[StageResult]) -> tuple[int, ...]:
-    """Contact particles of the candidates of all stages since the last one that gained at least `LEAST_GAIN`."""
+    """Contact particles of the candidates of all stages since the last one that gained at least `LEAST_GAIN`.
+
+    Those of an interrupted stage are not among them, since they had no chance to show what they gain.
+    """
     found: list[int] = []
     for stage in reversed(stages):
         if stage.loss < (1.0 - LEAST_GAIN) * stage.loss_before:
             break
+        if stage.status is Status.INTERRUPTED:
+            continue
         contacts = [candidate.proposal.contact_particle for candidate in stage.candidates]
         found += [contact for contact in contacts if contact is not None]
     return tuple(dict.fromkeys(found))
-
-
-@dataclasses.dataclass
-class _Execution:
-    """The plan that a stage has executed so far: none at first, when its loss is that of leaving the state as it is."""
-
-    loss: float
-    warm: tuple[object, ...] | None
-    trajectory: Trajectory | None = None
-    candidate: Candidate | None = None
 
 
 def _search_status(candidates: Sequence[Candidate], best: int | None, loss_before: float) -> Status:
@@ -356,7 +368,7 @@ def _search_status(candidates: Sequence[Candidate], best: int | None, loss_befor
 
 
 def _stage_result(
-    bench: Workbench, candidates: list[Candidate], best: int | None, status: Status, execution: _Execution
+    bench: Workbench, candidates: list[Candidate], best: int | None, status: Status, execution: Execution
 ) -> StageResult:
     """What a stage came to; without an executed plan its state is the one before."""
     trajectory, state = execution.trajectory, bench.stage.state

@@ -113,6 +113,7 @@ class TrajectoryOptimizer:
         warm: Sequence[object] | None = None,
         executor: Executor | None = None,
         on_iteration: Callable[[Iteration], None] | None = None,
+        on_start: Callable[[Race], None] | None = None,
     ) -> OptimizationResult:
         """Minimise the objective over the actions of each world.
 
@@ -125,12 +126,15 @@ class TrajectoryOptimizer:
             warm: What the objective can start from in the first evaluation of each world, B entries; None for nothing.
             executor: Where batches are computed; defaults to this process.
             on_iteration: Called after each iteration.
+            on_start: Called once with the worlds on their way down, which hold the best plans so far at any time.
 
         Returns:
             The best plan of each world. A world that the pruner drops keeps its best plan so far and stops, as does one whose
             loss or gradient is not finite where it may not go back to a plan before.
         """
         race = Race.begin(state, actions, backtrack=self.backtrack, warm=warm)
+        if on_start is not None:
+            on_start(race)
         evaluator, executor = Evaluator(simulator, objective), executor or ExecutorSerial()
         history: list[Iteration] = []
         since_improvement = 0

@@ -21,6 +21,12 @@ class Status(enum.Enum):
     NO_IMPROVEMENT = "no_improvement"
     NO_PLACEMENT = "no_placement"
     NON_FINITE = "non_finite"
+    INTERRUPTED = "interrupted"
+
+    @property
+    def executed(self) -> bool:
+        """Whether a plan was executed, so that the state is another one."""
+        return self in (Status.FINISHED, Status.INTERRUPTED)
 
     @property
     def advice(self) -> str:
@@ -42,6 +48,7 @@ _ADVICE = {
         "Every plan's simulation left the finite numbers before it lowered the loss, or the best one did when it was executed. "
         "Lower the action scale, the stiffness or the time step of the scene."
     ),
+    Status.INTERRUPTED: "Interrupted; the best plan so far was executed. Go on from there with --resume.",
 }
 
 
@@ -51,7 +58,7 @@ class StageResult:
 
     Attributes:
         index: Number of the stage, from 0; a resumed run goes on counting.
-        status: How it ended; the state is unchanged unless it is `Status.FINISHED`.
+        status: How it ended; the state is unchanged unless `Status.executed`.
         state_before: State S_i, a single world, tools as the stage found them.
         state: State S_{i+1} after the executed plan.
         priorities: Transport priorities f (N,), cost or length units (see `transport_priorities`); nan where the placer needs none.

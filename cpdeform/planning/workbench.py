@@ -19,6 +19,26 @@ from cpdeform.core.task import Task
 from cpdeform.planning.batches import Evaluator, evaluate_worlds
 from cpdeform.planning.executor import Executor, ExecutorSerial
 from cpdeform.planning.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
+from cpdeform.planning.race import Race
+
+
+@dataclasses.dataclass(kw_only=True)
+class Racing:
+    """A descent, while it runs and until its candidates are kept.
+
+    Attributes:
+        phase: Name of the phase that asked for it.
+        objective: Its loss.
+        candidates: Its candidates, one a world.
+        race: The worlds; None before they start.
+        first_loss: Loss of the first candidate's first actions; None before it is known.
+    """
+
+    phase: str
+    objective: Objective
+    candidates: tuple[Candidate, ...]
+    race: Race | None = None
+    first_loss: float | None = None
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -37,6 +57,8 @@ class Workbench:
         gradient_evaluations: Gradients computed so far, of all worlds together.
         rollouts: Rollouts without a gradient so far.
         history: Every iteration so far, in order.
+        candidates: The candidates of all rounds that are over.
+        racing: The descent that runs, or ran last; None once its candidates are kept.
         seconds: Wall time by part.
     """
 
@@ -51,6 +73,8 @@ class Workbench:
     gradient_evaluations: int = 0
     rollouts: int = 0
     history: list[Iteration] = dataclasses.field(default_factory=list)
+    candidates: list[Candidate] = dataclasses.field(default_factory=list)
+    racing: Racing | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -61,6 +85,11 @@ class Workbench:
         now = time.perf_counter()
         self.seconds[name] = self.seconds.get(name, 0.0) + now - self._mark
         self._mark = now
+
+    def keep(self, candidates: Sequence[Candidate]) -> None:
+        """Keep the candidates of a round that is over."""
+        self.candidates += candidates
+        self.racing = None
 
     def total(self) -> float:
         """Wall time since the stage began, seconds."""
@@ -104,26 +133,37 @@ class Workbench:
             objective: The loss; None for the stage's own.
             phase: Name of the phase that asks.
         """
-        history: list[Iteration] = []
+        self._announce(len(candidates))
+        loss = self.objective if objective is None else objective
+        racing = self.racing = Racing(phase=phase, objective=loss, candidates=tuple(candidates))
+        first = len(self.history)
+
+        def begin(race: Race) -> None:
+            racing.race = race
 
         def note(iteration: Iteration) -> None:
-            history.append(dataclasses.replace(iteration, phase=phase))
-            self.on_iteration(history[-1])
+            self.history.append(dataclasses.replace(iteration, phase=phase))
+            if racing.first_loss is None:
+                racing.first_loss = float(iteration.loss[0])
+            self.on_iteration(self.history[-1])
 
-        self._announce(len(candidates))
-        found = optimizer.minimize(
-            self.simulator,
-            self.worlds(candidates),
-            torch.stack([candidate.actions for candidate in candidates]),
-            self.objective if objective is None else objective,
-            rest_steps=self.task.rest_steps,
-            warm=self._warm(objective, len(candidates)),
-            executor=self.executor,
-            on_iteration=note,
-        )
+        try:
+            found = optimizer.minimize(
+                self.simulator,
+                self.worlds(candidates),
+                torch.stack([candidate.actions for candidate in candidates]),
+                loss,
+                rest_steps=self.task.rest_steps,
+                warm=self._warm(objective, len(candidates)),
+                executor=self.executor,
+                on_iteration=note,
+                on_start=begin,
+            )
+        except KeyboardInterrupt:
+            self.gradient_evaluations += racing.race.evaluations if racing.race is not None else 0
+            raise
         self.gradient_evaluations += found.gradient_evaluations
-        self.history += history
-        return dataclasses.replace(found, history=tuple(history))
+        return dataclasses.replace(found, history=tuple(self.history[first:]))
 
     def rollout_losses(self, candidates: Sequence[Candidate], objective: Objective | None, *, phase: str) -> Tensor:
         """Losses (B,) of the candidates' actions by rollouts without gradients; nan where one is not finite.

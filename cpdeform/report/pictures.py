@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpdeform.core.errors import InputError
-from cpdeform.planning.result import StageResult, Status
+from cpdeform.planning.result import StageResult
 from cpdeform.report.render import Array, Camera, fit_camera, render
 from cpdeform.report.shapes import tool_surface
 from cpdeform.run.record import RunRecord
@@ -60,7 +60,7 @@ def draw_picture(record: RunRecord) -> Path:
     placed = stage.candidates[stage.best].proposal.pose if stage.best is not None else stage.state_before.manipulator_pose[0]
     _draw_panel(axes[0], view, record, "start", start.position[0], start.manipulator_pose[0])
     _draw_priorities(figure, axes[1], view, record, stage, placed)
-    title = "result" if last.status is Status.FINISHED or record.finished_stages else "result (no plan was executed)"
+    title = "result" if last.status.executed or record.finished_stages else "result (no plan was executed)"
     _draw_panel(axes[2], view, record, title, result.position[0], result.manipulator_pose[0])
     # The goal often has another number of particles than the body.
     target_view = dataclasses.replace(view, radius=_particle_radius(_numbers(record.target)))

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import errno
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,12 +39,13 @@ from cpdeform.run.record_files import (
     check_directory,
     environment,
     own_files,
-    replacing,
+    replacing_hdf5,
     stage_file,
     to_json,
     write_dataset,
     write_json,
 )
+from cpdeform.run.record_lock import RecordLock
 from cpdeform.run.record_reader import RunRecord, load_record
 from cpdeform.run.record_stage import write_stage
 
@@ -52,12 +54,15 @@ __all__ = ["RunRecord", "RunRecorder", "load_record", "save_result"]
 FORMAT = 2
 """Version of the record's layout."""
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FULL_REMEDY = "Free some space, or choose another directory (--out); the finished stages are kept, and --resume goes on from them."
+
 
 class RunRecorder(Observer):
     """Writes the record of a run while it goes on.
 
     Nothing is written before the run starts. As a context manager it also records how the run broke off, if it does:
-    ``"interrupted"`` (by the user) or ``"failed"``.
+    ``"interrupted"`` (by the user) or ``"failed"``. While the run goes on no other process can write to the directory.
 
     Args:
         directory: Where to write; made if missing.
@@ -66,7 +71,7 @@ class RunRecorder(Observer):
         resumed_from: The record that the run goes on from, to be named in this one.
 
     Raises:
-        InputError: The directory is not empty (without `overwrite`) or cannot be written.
+        InputError: The directory is not empty (without `overwrite`) or cannot be written, or another run is writing to it.
     """
 
     def __init__(
@@ -83,7 +88,20 @@ class RunRecorder(Observer):
         self._overwrite = overwrite
         self._run: dict[str, Any] = {}
         self._batch: dict[int, int] = {}
+        self._rescued = False
         check_directory(self.directory, overwrite=overwrite)
+        self._lock = RecordLock(self.directory)
+        self._lock.check()
+
+    @property
+    def rescued(self) -> bool:
+        """Whether the last stage was interrupted and its best plan so far is recorded."""
+        return self._rescued
+
+    @property
+    def stages(self) -> int:
+        """Number of stages that are recorded and executed a plan."""
+        return int(self._run.get("stages_finished", 0))
 
     @property
     def started(self) -> bool:
@@ -95,6 +113,9 @@ class RunRecorder(Observer):
         check_directory(self.directory, overwrite=self._overwrite)
         with self._writing():
             self.directory.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire()
+            # Another run may have come to its end here since the check above.
+            check_directory(self.directory, overwrite=self._overwrite)
             for path in own_files(self.directory):
                 path.unlink()
             self._run = {
@@ -112,7 +133,7 @@ class RunRecorder(Observer):
                 # The goal is the copy beside this file.
                 "task": {**task.model_dump(mode="json"), "target": TARGET_FILE},
             }
-            with replacing(self.directory / TARGET_FILE) as temporary, h5py.File(temporary, "w") as file:
+            with replacing_hdf5(self.directory / TARGET_FILE) as file:
                 write_dataset(file, "position", target, shape="particle, xyz", units="length (domain edge = 1)")
                 _write_goal_extras(file, task)
             (self.directory / METRICS_FILE).write_text("", encoding="utf-8")
@@ -165,9 +186,10 @@ class RunRecorder(Observer):
                 "seconds": result.seconds,
             }
         )
+        self._rescued = result.status is Status.INTERRUPTED
         with self._writing():
             write_stage(self.directory / stage_file(result.index), result)
-            self._run["stages_finished"] += result.status is Status.FINISHED
+            self._run["stages_finished"] += result.status.executed
             self._write_run()
 
     def run_finished(self, result: DeformResult) -> None:
@@ -184,17 +206,23 @@ class RunRecorder(Observer):
             rollouts=result.rollouts,
             seconds=result.seconds,
         )
+        self._lock.release()
 
     def __enter__(self) -> RunRecorder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """Record that the run broke off, unless it is over or never began."""
-        if error is None or self._run.get("status") != "running":
-            return
+        try:
+            if error is not None and self._run.get("status") == "running":
+                self._break_off(error)
+        finally:
+            self._lock.release()
+
+    def _break_off(self, error: BaseException) -> None:
         if isinstance(error, KeyboardInterrupt):
             advice = "Interrupted; the finished stages are complete."
-            self._finish(status="interrupted", advice=advice)
+            self._finish(status=Status.INTERRUPTED.value, advice=Status.INTERRUPTED.advice if self._rescued else advice)
         else:
             # What broke the run is raised anyway; that the record cannot say so must not hide it.
             with contextlib.suppress(RecordError):
@@ -218,7 +246,8 @@ class RunRecorder(Observer):
         try:
             yield
         except OSError as error:
-            raise RecordError(f"cannot write the run record in {self.directory}: {error.strerror or error}.") from error
+            text = f"cannot write the run record in {self.directory}: {error.strerror or error}."
+            raise RecordError(f"{text} {FULL_REMEDY}" if error.errno in FULL else text) from error
 
 
 def _write_goal_extras(file: h5py.File, task: Task) -> None:

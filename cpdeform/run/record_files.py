@@ -9,6 +9,7 @@ import math
 import os
 import platform
 import re
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import h5py
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
+from cpdeform.run.record_lock import LOCK_FILE
 
 RUN_FILE = "run.json"
 METRICS_FILE = "metrics.jsonl"
@@ -40,7 +42,7 @@ def stage_files(directory: Path) -> list[Path]:
 
 def own_files(directory: Path) -> list[Path]:
     """Files in a directory that belong to a run record, left-over temporary ones included."""
-    return sorted(path for path in directory.iterdir() if path.is_file() and _is_own(path.name))
+    return sorted(path for path in directory.iterdir() if (path.is_file() or path.is_symlink()) and _is_own(path.name))
 
 
 def _is_own(name: str) -> bool:
@@ -62,7 +64,7 @@ def check_directory(directory: Path, *, overwrite: bool) -> None:
     try:
         if directory.exists() and not directory.is_dir():
             raise InputError(argument, came="a file", expected="a directory, or a path that does not exist yet")
-        if not overwrite and directory.is_dir() and any(directory.iterdir()):
+        if not overwrite and directory.is_dir() and any(path.name != LOCK_FILE for path in directory.iterdir()):
             raise InputError(
                 argument,
                 came="a directory that is not empty",
@@ -83,12 +85,9 @@ def _try_writing(directory: Path) -> None:
         for path in reversed(missing):
             path.mkdir()
             made.append(path)
-        probe = directory / ".run.tmp.json"
-        existed = probe.exists()
-        with probe.open("ab"):
+        # A name of its own: an existing one may be a link to a file elsewhere.
+        with tempfile.TemporaryFile(dir=directory):
             pass
-        if not existed:
-            probe.unlink()
     finally:
         for path in reversed(made):
             path.rmdir()
@@ -106,6 +105,20 @@ def replacing(path: Path) -> Iterator[Path]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+@contextlib.contextmanager
+def replacing_hdf5(path: Path) -> Iterator[h5py.File]:
+    """Give an HDF5 file in memory; what it holds at the end takes the place of `path`, in one step.
+
+    HDF5 itself never writes to the disk: where that is full, its library cannot close the file, and ends the process.
+    """
+    with h5py.File(path, "w", driver="core", backing_store=False) as file:
+        yield file
+        file.flush()
+        image = file.id.get_file_image()
+    with replacing(path) as temporary:
+        temporary.write_bytes(image)
 
 
 def to_json(value: Any) -> Any:

@@ -19,7 +19,7 @@ from cpdeform.core.reading.limits import ReadingLimits, default_limits
 from cpdeform.core.reading.models import validate
 from cpdeform.core.state import State
 from cpdeform.core.task import Task
-from cpdeform.planning.result import StageResult, Status
+from cpdeform.planning.result import StageResult
 from cpdeform.run.migration import current_task
 from cpdeform.run.record_files import METRICS_FILE, RUN_FILE, TARGET_FILE, stage_files
 from cpdeform.run.record_stage import read_stage
@@ -61,7 +61,7 @@ class RunRecord:
     @property
     def finished_stages(self) -> int:
         """Number of stages whose plan was executed."""
-        return sum(stage.status is Status.FINISHED for stage in self.stages)
+        return sum(stage.status.executed for stage in self.stages)
 
     @property
     def next_stage(self) -> int:

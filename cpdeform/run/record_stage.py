@@ -18,7 +18,7 @@ from cpdeform.core.reading.json_text import parse_json
 from cpdeform.core.reading.limits import ReadingLimits
 from cpdeform.core.state import State
 from cpdeform.planning.result import StageResult, Status
-from cpdeform.run.record_files import replacing, to_json, write_dataset
+from cpdeform.run.record_files import replacing_hdf5, to_json, write_dataset
 
 MARGIN = 1e-3
 """How far outside of the domain a recorded position may lie for its rounding, length units."""
@@ -36,7 +36,7 @@ STATE_FIELDS = {
 
 def write_stage(path: Path, result: StageResult) -> None:
     """Write a stage atomically."""
-    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with replacing_hdf5(path) as file:
         file.attrs["index"] = result.index
         file.attrs["status"] = result.status.value
         file.attrs["best"] = -1 if result.best is None else result.best
@@ -181,7 +181,7 @@ def _check_stage(stage: StageResult, argument: str) -> None:
     if stage.best is not None and stage.best >= len(stage.candidates):
         raise InputError(f"{argument}: best", came=str(stage.best), expected=f"one of {len(stage.candidates)} candidates")
     plan = (stage.actions, stage.positions, stage.manipulator_poses)
-    if stage.status is Status.FINISHED and any(part is None for part in plan):
+    if stage.status.executed and any(part is None for part in plan):
         raise InputError(
             argument, came="a finished stage without a plan", expected="actions, positions, manipulator_poses and best"
         )

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -9,8 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from children import interruptible_command, interrupts_ignored
-from toy_fixtures import TOYS
+from children import child_environment, interruptible_command, interrupts_ignored
 from typer.testing import CliRunner
 
 from cpdeform import __version__
@@ -270,7 +268,7 @@ def test_heavy_modules_are_not_imported(arguments):
 
 def test_interruption(directory, toy_distribution):
     """Control-C in a run: exit code 130, and a message where the record is."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TOYS), str(toy_distribution)])}
+    environment = child_environment(toy_distribution)
     arguments = ["run", "shift.yaml", *PARTS[:-1], "100000", "--out", "run", "--set", "simulator_options.delay=0.01"]
     arguments += ["--set", "optimizer.patience=100000"]
     with interrupts_ignored():

@@ -186,7 +186,7 @@ def test_nothing_is_written_before_the_run_starts(tmp_path):
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), "interrupted"), (RuntimeError("boom"), "failed")])
 def test_a_run_that_breaks_off_says_so(tmp_path, run, error, status):
     class Break(Observer):
-        def iteration_finished(self, stage, iteration):
+        def optimization_started(self, stage, worlds, memory_estimate):
             if stage == 1:
                 raise error
 
@@ -195,7 +195,7 @@ def test_a_run_that_breaks_off_says_so(tmp_path, run, error, status):
         run(observers=[recorder, Break()])
     record = load_record(tmp_path / "run")
     assert (record.status, record.finished_stages) == (status, 1)
-    assert record.metrics[-1]["kind"] == "iteration"
+    assert record.metrics[-1]["kind"] == "stage"
 
 
 def test_a_failing_disk_leaves_no_half_file(tmp_path, run, monkeypatch):
@@ -296,7 +296,7 @@ class Slow(SimulatorToy):
         return super().rollout(state, actions)
 
 task = load_task({task!r})
-modules = dict(toy="cpdeform_toy.plugin", strategies="cpdeform.planning.plugin")
+modules = {{"toy": "cpdeform_toy.plugin", "strategies": "cpdeform.planning.plugin"}}
 registry = load_registry([importlib.metadata.EntryPoint(name, module, "cpdeform") for name, module in modules.items()])
 deform(task, simulator=Slow(task.scene, batch_size=4), ot_solver="toy", placer="toy", stages=2, registry=registry,
        optimizer=TrajectoryOptimizer(iterations=100000, patience=20), observers=[RunRecorder({out!r})])

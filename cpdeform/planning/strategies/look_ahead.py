@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.state import State
 from cpdeform.planning.algorithm import Planner, Start
+from cpdeform.planning.interrupted import StageInterrupted
 from cpdeform.planning.result import StageResult, Status
 from cpdeform.planning.strategies.cpdeform import StrategyCpdeform
 
@@ -57,29 +58,32 @@ class StrategyLookAhead(StrategyCpdeform):
         self.width = width
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
-        """Stages of the best path, known only when all paths have come to their end."""
-        paths, spent = [Path((), start.state)], []
-        failed: StageResult | None = None
+        """Stages of the best path, known only when all paths have come to their end, or the run is interrupted."""
+        paths, spent = [Path((), start.state)], list[list[StageResult]]()
+        failed: tuple[StageResult, ...] = ()
         for index in range(start.first_stage, start.first_stage + start.stages):
             ends: list[Path] = []
             tried: list[StageResult] = []
+            spent.append(tried)
             for path in paths:
-                result = planner.stage(start, index, path.state, path.results, warm=path.warm)
-                found = self._ends(planner, result)
+                try:
+                    result = planner.stage(start, index, path.state, path.results, warm=path.warm)
+                    found = self._ends(planner, result)
+                except KeyboardInterrupt as interruption:
+                    if isinstance(interruption, StageInterrupted):
+                        tried.append(interruption.result)
+                        ends.append(path.then(interruption.result))
+                    best = min([*ends, *paths], key=lambda path: path.loss)
+                    yield from _counted(best.results, spent)
+                    raise
                 others = min(self.width, len(result.candidates)) - 1 if found else 0
                 tried.append(dataclasses.replace(result, rollouts=result.rollouts + others))
                 ends += [path.then(end) for end in found]
-            spent.append(tried)
             if not ends:
-                failed = tried[0]
+                failed = (tried[0],)
                 break
             paths = sorted(ends, key=lambda path: path.loss)[: self.width]
-        for result, tried in zip([*paths[0].results, *([failed] if failed else [])], spent, strict=True):
-            yield dataclasses.replace(
-                result,
-                gradient_evaluations=sum(other.gradient_evaluations for other in tried),
-                rollouts=sum(other.rollouts for other in tried),
-            )
+        yield from _counted((*paths[0].results, *failed), spent)
 
     def _ends(self, planner: Planner, result: StageResult) -> list[StageResult]:
         """What the best candidates of a stage lead to."""
@@ -89,3 +93,13 @@ class StrategyLookAhead(StrategyCpdeform):
         others = [number for number in order if number != result.best][: self.width - 1]
         found = [planner.execute_other(result, number) for number in others]
         return [result, *(end for end in found if end is not None)]
+
+
+def _counted(results: Sequence[StageResult], spent: Sequence[Sequence[StageResult]]) -> Iterator[StageResult]:
+    """The stages of a path, each with what was spent on the stages of its number on all paths."""
+    for result, tried in zip(results, spent, strict=False):
+        yield dataclasses.replace(
+            result,
+            gradient_evaluations=sum(other.gradient_evaluations for other in tried),
+            rollouts=sum(other.rollouts for other in tried),
+        )
