@@ -17,9 +17,13 @@ from cpdeform.core.placer import Stage
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.state import initial_state
 from cpdeform.core.task import changed_task, list_variants, load_task, task_path
+from cpdeform.planning.result import StageResult, Status
 from cpdeform.planning.strategies.paper import PLACER_OPTIONS, StrategyPaper
 from cpdeform.planning.strategy import Strategy
+from cpdeform.report import draw_run
 from cpdeform.run.deform import deform
+from cpdeform.run.evaluation import evaluate_record
+from cpdeform.run.record import RunRecorder
 from cpdeform.run.record_reader import load_record
 from cpdeform.run.resolve import PartObjects, resolve
 from cpdeform.run.resume import OPTIONS_OF
@@ -146,6 +150,43 @@ def test_every_task_resolves_to_the_same_run_from_everywhere(strategy, registry)
             assert type(other.strategy) is type(first.strategy)
 
 
+def recorded(run, directory):
+    """A record of a run whose first stage found no plan."""
+    state = initial_state(run.task.scene, dtype=torch.float32)
+    target = torch.as_tensor(run.task.load_target()).float()
+    recorder = RunRecorder(directory, configuration=run.configuration)
+    recorder.run_started(run.task, target, run.names, run.configuration.seed)
+    nothing = {"best": None, "actions": None, "positions": None, "manipulator_poses": None, "candidates": ()}
+    recorder.stage_finished(
+        StageResult(
+            index=0,
+            status=Status.NO_IMPROVEMENT,
+            state_before=state,
+            state=state,
+            priorities=state.position[0, :, 0],
+            loss_before=1.0,
+            loss=1.0,
+            gradient_evaluations=0,
+            history=(),
+            seconds={},
+            **nothing,
+        )
+    )
+    return load_record(directory)
+
+
+def test_every_resumed_run_resolves_to_the_same(registry, tmp_path):
+    for name in every_task():
+        first = resolve({"task": name}, registry=registry)
+        record = recorded(first, tmp_path / name)
+        for other in (resolve({}, record=record, registry=registry), resolve({"task": name}, record=record, registry=registry)):
+            stages = {"stages": first.configuration.stages}
+            assert other.configuration.model_copy(update=stages) == first.configuration, name
+            assert other.task.model_copy(update={"target": first.task.target}) == first.task, name
+            assert (other.first_stage, len(other.previous)) == (1, 1)
+        shutil.rmtree(tmp_path / name)
+
+
 def test_a_resumed_run_resolves_to_the_same(make_toy_task, registry, tmp_path, toy_entry_points):
     """Wherever the record lies now, whatever became of the task's files, and in Python as on the command line."""
     path = make_toy_task(limits={"manipulators": {"0": {"lower_bound": [0.0, 0.02, 0.0]}}}, stage_count=3)
@@ -160,6 +201,9 @@ def test_a_resumed_run_resolves_to_the_same(make_toy_task, registry, tmp_path, t
     (path.parent / "target.npz").unlink()
     record = load_record(tmp_path / "elsewhere")
     assert torch.equal(torch.as_tensor(record.task.load_target()).to(record.target), record.target)
+    evaluation = evaluate_record(record)
+    assert evaluation.wasserstein_final < evaluation.wasserstein_start
+    assert draw_run(record.directory).is_file()
     rest = resolve({"stages": 2}, record=record, registry=toys)
     assert rest.configuration.model_copy(update={"stages": None}) == whole.configuration.model_copy(
         update={"task": rest.configuration.task}
