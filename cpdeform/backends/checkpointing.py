@@ -21,8 +21,8 @@ class SimulatorCheckpointing(Simulator):
         scene: What to simulate.
         batch_size: The most worlds that one call may hold.
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
-        dtype: Floating-point type; the backend's first declared one where absent.
-        threads: Threads on the CPU; those the process may use where absent.
+        dtype: Floating-point type; defaults to the backend's first declared one.
+        threads: Threads on the CPU; defaults to those the process may use.
         memory_budget: Bytes that a rollout may keep for its way back. Where all substeps fit, none is computed twice; otherwise
             one checkpoint per environment step is kept and the inside recomputed.
 

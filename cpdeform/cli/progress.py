@@ -37,7 +37,7 @@ class ProgressBar(Progress):
     """A bar with stage, iteration, loss, best loss and time left; for terminals. A context manager.
 
     Args:
-        stages: Number of stages; the task's own where absent.
+        stages: Number of stages; defaults to the task's own.
         first_stage: Number of the first stage.
     """
 

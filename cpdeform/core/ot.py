@@ -108,8 +108,8 @@ class OTSolver(abc.ABC):
         Args:
             source: Source positions (N, 3), length units.
             target: Target positions (M, 3), length units, same device and type.
-            source_weights: Non-negative weights (N,) summing to 1; uniform where absent.
-            target_weights: Non-negative weights (M,) summing to 1; uniform where absent.
+            source_weights: Non-negative weights (N,) summing to 1; defaults to uniform ones.
+            target_weights: Non-negative weights (M,) summing to 1; defaults to uniform ones.
             previous: Result of a nearby problem of the same sizes, to start from.
 
         Returns:

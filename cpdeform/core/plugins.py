@@ -332,7 +332,7 @@ def load_registry(entry_points: Iterable[importlib.metadata.EntryPoint] | None =
     """Discover all plugins.
 
     Args:
-        entry_points: What to load; the installed entry points of the group `cpdeform` where absent.
+        entry_points: What to load; defaults to the installed entry points of the group `cpdeform`.
 
     Returns:
         A fresh registry. What cannot be used, plugins or single parts of them, is in its `failures`; everything else works.

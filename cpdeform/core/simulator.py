@@ -92,7 +92,7 @@ class Simulator(abc.ABC):
         scene: What to simulate.
         batch_size: The most worlds that one call may hold.
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
-        dtype: Floating-point type; the backend's first declared one where absent.
+        dtype: Floating-point type; defaults to the backend's first declared one.
 
     Raises:
         CapabilityError: The backend does not support the device, the type or a manipulator of the scene.
@@ -128,7 +128,7 @@ class Simulator(abc.ABC):
                 )
 
     def initial_state(self, *, batch_size: int | None = None) -> State:
-        """The scene's start in `batch_size` worlds (this simulator's batch size where absent), on its device."""
+        """The scene's start in `batch_size` worlds (defaults to this simulator's batch size), on its device."""
         return initial_state(self.scene, batch_size=batch_size or self.batch_size, device=self.device, dtype=self.dtype)
 
     def check_inputs(self, state: State, actions: Tensor) -> None:
@@ -208,7 +208,7 @@ class Simulator(abc.ABC):
 
         Args:
             step_count: Environment steps T.
-            worlds: Number of worlds B; this simulator's `batch_size` where absent.
+            worlds: Number of worlds B; defaults to this simulator's `batch_size`.
 
         Returns:
             Bytes; within a fifth of what is measured while the bodies stay about as large as they are at the start.

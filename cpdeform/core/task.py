@@ -245,7 +245,7 @@ def load_task(name: str | Path, *, registry: Registry | None = None) -> Task:
 
     Args:
         name: Registered name, with a variant or without (then the first variant), or path of a YAML file.
-        registry: Where to look names up; the installed plugins where absent.
+        registry: Where to look names up; defaults to the installed plugins.
 
     Raises:
         UnknownNameError: No plugin registers the name.

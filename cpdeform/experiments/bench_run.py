@@ -44,7 +44,7 @@ class RunBenchSettings:
         threads: Threads of torch and, where it takes such an option, of the simulator.
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         iterations: The most gradient steps per stage.
-        stages: Number of stages; the task's own where absent.
+        stages: Number of stages; defaults to the task's own.
         timeout: Seconds after which a run is given up.
 
     Raises:

@@ -39,7 +39,7 @@ class SimulatorBenchSettings:
         worlds: Numbers of worlds of a batch.
         threads: Numbers of threads.
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
-        dtype: ``"float32"`` or ``"float64"``; each simulator's default where absent.
+        dtype: ``"float32"`` or ``"float64"``; defaults to the first type that a simulator declares.
         steps: Environment steps of a rollout.
         repeat: Rollouts and gradients timed; the median counts.
         timeout: Seconds after which a combination is given up.

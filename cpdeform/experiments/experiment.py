@@ -159,9 +159,9 @@ def recorded_runs(
 
     Args:
         out: Directory of the records.
-        tasks: Names of the tasks to look for, with a variant or without; all where absent.
-        methods: Names of the methods; all where absent.
-        seeds: Seeds; all where absent.
+        tasks: Names of the tasks to look for, with a variant or without; defaults to all.
+        methods: Names of the methods; defaults to all.
+        seeds: Seeds; defaults to all.
 
     Raises:
         InputError: There is no such directory, or no run in it.

@@ -59,13 +59,13 @@ class ExperimentSettings:
         methods: Names of `METHODS`.
         seeds: Seeds.
         out: Directory of the records and tables.
-        iterations: The most gradient steps per stage; the task's or the default where absent.
-        stages: Number of stages; the task's own where absent.
-        particles: Number of particles of all bodies together, shared out as the task does; the task's own where absent.
+        iterations: The most gradient steps per stage; defaults to what the strategy sets.
+        stages: Number of stages; defaults to the task's own.
+        particles: Number of particles of all bodies together, shared out as the task does; defaults to the task's own.
         targets: Directory with a goal ``<task name>.npz`` for every task, instead of the tasks' own.
-        backend: Registered name of the simulator; the default where absent.
-        ot: Registered name of the transport solver; the default where absent.
-        device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``; the default where absent.
+        backend: Registered name of the simulator; defaults to that of `RunConfiguration`.
+        ot: Registered name of the transport solver; defaults to that of `RunConfiguration`.
+        device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``; defaults to that of `RunConfiguration`.
         options: Further fields of `RunConfiguration`, nested, for every run.
         equal_evaluations: Give ``fixed`` as many gradient evaluations per stage as ``cpdeform`` used.
         paper_metric: Also take W1 with the paper's settings.

@@ -38,7 +38,7 @@ class SimulatorMeasurement:
         particles: Particles N of a world.
         worlds: Worlds B of the batch.
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
-        dtype: ``"float32"`` or ``"float64"``; the simulator's default where absent.
+        dtype: ``"float32"`` or ``"float64"``; defaults to the first type that it declares.
         threads: Threads on the CPU, for simulators that have such an option.
         steps: Environment steps T of a rollout.
         repeat: Rollouts and gradients that are timed; with 0 only memory is measured.

@@ -25,8 +25,8 @@ class GridOptions:
         grid_size: Positions along each axis of every grid.
         refinements: Number of finer grids after the first; each spans the widest spacing of the grid before to either side.
         clearance: Least distance between the tool's surface and any particle or fixed tool, length units.
-        margin: How far beyond touching the contact point the first grid reaches, length units; half of the tool's smallest
-            half extent where absent.
+        margin: How far beyond touching the contact point the first grid reaches, length units; defaults to half of the
+            tool's smallest half extent.
         max_gap: Largest distance, beyond `clearance`, between the tool and the nearest particle, length units; grids of a
             wider spacing allow that spacing. None allows any. A tool acts on the clay only within about 0.0035.
 
@@ -82,8 +82,8 @@ class ToolGrid:
         stage: Body, tools and bounds.
         index: Which tool is moved.
         options: How finely to search.
-        poses: Poses (M, 8) of all tools; those of the state where absent.
-        obstacles: Indices of the tools that must not be touched; all others where absent.
+        poses: Poses (M, 8) of all tools; defaults to those of the state.
+        obstacles: Indices of the tools that must not be touched; defaults to all others.
 
     Raises:
         InputError: The stage's state holds several worlds.

@@ -21,7 +21,7 @@ class Descent:
 
     Args:
         actions: First actions (B, T, A).
-        backtrack: Steps without a gain after which a world goes back; where absent never, not even a world that broke.
+        backtrack: Steps without a gain after which a world goes back; None for never, not even of a world that broke.
 
     References:
         .. [1] Kingma, Ba, "Adam: A Method for Stochastic Optimization", ICLR 2015.

@@ -45,7 +45,7 @@ def evaluate_metric(task: Task, *, start: Tensor, final: Tensor, target: Tensor,
         start: Particles (N, 3) of the scene's start, length units.
         final: Particles (N, 3) at the end.
         target: Goal particles (M, 3).
-        registry: Where the transport solver is looked up; the installed plugins where absent.
+        registry: Where the transport solver is looked up; defaults to the installed plugins.
 
     Returns:
         Normalised incremental IoU in [0, 1] (more is better; the start has 0), or the Wasserstein distance of `wasserstein` in
@@ -73,7 +73,7 @@ def metric_solver(*, solver: str = AUTO, blur: float = METRIC_BLUR, registry: Re
     Args:
         solver: A registered name; ``"auto"`` is the fastest that is installed for the CPU.
         blur: Entropic blur, length units.
-        registry: Where the name is looked up; the installed plugins where absent.
+        registry: Where the name is looked up; defaults to the installed plugins.
 
     Raises:
         UnknownNameError: There is no such solver.

@@ -66,7 +66,7 @@ class ObjectiveConfiguration(FrozenModel):
         points: Particles that the transport loss is computed on, a fixed random subset; None for all.
         blur: Entropic blur of the transport loss, length units; at least a millionth of the domain's edge.
         refresh: Solve from scratch every so many evaluations, warm-started between.
-        contact_weight: Weight of PlasticineLab's contact term, which draws tools to the body; where absent 0 for ``"transport"``
+        contact_weight: Weight of PlasticineLab's contact term, which draws tools to the body; defaults to 0 for ``"transport"``
             and 1 for ``"plasticinelab"``.
         coast_steps: (``"transport"``) Environment steps for which particles are taken to go on as fast as in the last one; see
             `ObjectiveTransport`.
@@ -114,9 +114,9 @@ class RunConfiguration(FrozenModel):
         placer: Registered name of the placer.
         device: Where tensors live, ``"cpu"`` or ``"cuda"``.
         seed: Seed of first actions and random placements.
-        stages: Number of stages; the task's own where absent.
-        steps: Environment steps of a stage; the task's own where absent.
-        rest_steps: Environment steps of rest after them; the task's own where absent.
+        stages: Number of stages; defaults to the task's own.
+        steps: Environment steps of a stage; defaults to the task's own.
+        rest_steps: Environment steps of rest after them; defaults to the task's own.
         target: File of the goal instead of the task's own, e.g. one written by `cpdeform task import-grid`.
         strategy: Registered name of the strategy: ``"cpdeform"``, or ``"paper"`` for Algorithm 1 to the letter. What it sets, the
             user overrides.

@@ -116,9 +116,9 @@ def evaluate(
         target: Goal particles (M, 3).
         solver: The transport solver of ``converged``, as `metric_solver` makes it, or its registered name.
         paper: Whether to compute the ``paper`` distance, too (about two minutes for 10,000 particles).
-        paper_blur: Its blur; where absent 1e-3, or 1e-5 for a task of several stages, as in the paper.
+        paper_blur: Its blur; defaults to 1e-3, or 1e-5 for a task of several stages, as in the paper.
         exact: Whether to compute the ``exact`` distance, too (a minute and more, and 4.3 GB, for 10,000 particles).
-        registry: Where names are looked up; the installed plugins where absent.
+        registry: Where names are looked up; defaults to the installed plugins.
 
     Raises:
         InputError: Positions do not fit the task.
@@ -230,7 +230,7 @@ def paper_wasserstein(first: Tensor, second: Tensor, *, blur: float, registry: R
         first: Positions (N, 3), length units.
         second: Positions (M, 3).
         blur: Entropic blur, length units.
-        registry: Where GeomLoss is looked up; the installed plugins where absent.
+        registry: Where GeomLoss is looked up; defaults to the installed plugins.
 
     Raises:
         MissingExtraError: GeomLoss is not installed.
@@ -248,7 +248,7 @@ def exact_wasserstein(first: Tensor, second: Tensor, *, registry: Registry | Non
     Args:
         first: Positions (N, 3), length units.
         second: Positions (M, 3).
-        registry: Where solvers are looked up; the installed plugins where absent.
+        registry: Where solvers are looked up; defaults to the installed plugins.
 
     Returns:
         The distance in length units, and how it was computed.

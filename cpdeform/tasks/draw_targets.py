@@ -46,7 +46,7 @@ SHEETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 def main(
     out: Annotated[Path, typer.Option(help="Directory that the pictures are written to.")] = Path("docs/pictures"),
-    sheet: Annotated[list[str] | None, typer.Option(help="A sheet to draw; all where absent. May be repeated.")] = None,
+    sheet: Annotated[list[str] | None, typer.Option(help="A sheet to draw; defaults to all. May be repeated.")] = None,
 ) -> None:
     """Draw the contact sheets."""
     registry = load_registry()

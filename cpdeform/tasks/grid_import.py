@@ -168,7 +168,7 @@ def import_grid(
         task: Its scene gives grid, domain, and the number of particles.
         name: For messages and the result.
         path: Goal file to write, if any; its directory is made if missing.
-        particles: Number of particles; the task's body's where absent.
+        particles: Number of particles; defaults to the task's body's.
         seed: Seed of the sample.
 
     Raises:
@@ -211,10 +211,10 @@ def import_grids(
     Args:
         file: As for `read_grids`; its names are PlasticineLab's, see `PLASTICINELAB_NAMES`.
         directory: Where to write; made if missing.
-        names: Grids to import; where absent, all that have a task.
+        names: Grids to import; defaults to all that have a task.
         seed: Seed of the samples.
         overwrite: Replace files that are there.
-        registry: Where tasks are looked up; the installed plugins where absent.
+        registry: Where tasks are looked up; defaults to the installed plugins.
         on_imported: Called after each, for progress.
 
     Raises:

@@ -69,7 +69,7 @@ def agreement(task: Task, position: NDArray[np.float64]) -> float:
 
 
 def main(
-    tasks: Annotated[list[str] | None, typer.Argument(help="Names, e.g. airplane, writer or move-v2; all where absent.")] = None,
+    tasks: Annotated[list[str] | None, typer.Argument(help="Names, e.g. airplane, writer or move-v2; defaults to all.")] = None,
     check: Annotated[bool, typer.Option("--check", help="Compare with the files that are there instead of writing.")] = False,
     backend: Annotated[str, typer.Option(help="Simulator to make them with; must compute in float64.")] = AUTO,
 ) -> None:

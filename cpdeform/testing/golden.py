@@ -71,7 +71,7 @@ def compare_golden(
         golden: The recording.
         factory: Makes the simulator, see `SimulatorFactory`.
         device: Where to run.
-        dtype: Floating-point type; the simulator's default where absent.
+        dtype: Floating-point type; defaults to the simulator's default.
     """
     begin = time.perf_counter()
     try:

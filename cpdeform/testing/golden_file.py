@@ -97,8 +97,8 @@ def read_golden(
 
     Args:
         path: The file.
-        scenes: JSON file of scene definitions; ``plasticinelab/scenes.json`` beside the file's folder where absent.
-        targets: Target grids; ``plasticinelab/target_grids.npz`` beside the file's folder where absent, if it exists.
+        scenes: JSON file of scene definitions; defaults to ``plasticinelab/scenes.json`` beside the file's folder.
+        targets: Target grids; defaults to ``plasticinelab/target_grids.npz`` beside the file's folder, if it exists.
         limits: How large the file may be; defaults to `cpdeform.core.reading.limits.default_limits`.
 
     Raises:

@@ -34,8 +34,8 @@ def check_simulator(
 
     Args:
         factory: Called as ``factory(scene, batch_size=..., device=..., dtype=...)``: a `Simulator` class, or a partial of one.
-        scene: Scene of the checks that need no particular one (shapes, states, batches, gradients); a block of 300 particles
-            on the floor with two tools of the first declared kinds where absent.
+        scene: Scene of the checks that need no particular one (shapes, states, batches, gradients); defaults to a block of
+            300 particles on the floor with two tools of the first declared kinds.
         device: Where to test.
         only: Run only the checks of these names, or whose names contain these texts.
 

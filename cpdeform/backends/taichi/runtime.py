@@ -100,7 +100,7 @@ def require(device: torch.device, threads: int | None = None) -> int:
 
     Args:
         device: Where the simulator's tensors are.
-        threads: Threads that it works with on the CPU; those the process may use, and the pool has, where absent.
+        threads: Threads that it works with on the CPU; defaults to those that the process may use and the pool has.
 
     Returns:
         The number of threads.

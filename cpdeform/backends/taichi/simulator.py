@@ -60,7 +60,7 @@ class SimulatorTaichi(SimulatorCheckpointing):
         batch_size: The most worlds that one call may hold.
         device: ``"cpu"`` or ``"cuda"``, which is the first visible GPU.
         dtype: `torch.float32` (default) or `torch.float64`.
-        threads: Threads on the CPU; those the process may use where absent. Worlds are spread over them first, then the particles
+        threads: Threads on the CPU; defaults to those the process may use. Worlds are spread over them first, then the particles
             of one world (whose sums then depend on the number of threads in the last digits).
         memory_budget: Bytes that a rollout may keep for its way back. Where all substeps fit, none is computed twice; otherwise
             one checkpoint per environment step is kept and the inside recomputed.

@@ -109,7 +109,7 @@ class Lane:
         particle_count: Particles N of a world.
         pool: Threads for the blocks of one world; None for a single block.
         blocks: Number of blocks.
-        arrays: Gives work space; new arrays each time where absent.
+        arrays: Gives work space; defaults to new arrays each time.
         full_grid: Whether the grid is the whole one, whose size is known beforehand, on the CPU too.
     """
 
@@ -172,7 +172,7 @@ class Lane:
             particles: Particles before it.
             poses: Tool poses (W, frames, tools).
             frame: Number of the substep; tools move from this frame to the next.
-            after: Where the particles after the substep go; arrays of their own where absent.
+            after: Where the particles after the substep go; defaults to arrays of their own.
 
         Returns:
             The record for the adjoint, and the particles after the substep.

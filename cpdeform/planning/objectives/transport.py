@@ -47,7 +47,7 @@ class ObjectiveTransport(Objective):
     Args:
         solver: Solves the transport problems.
         target: Goal particles (M, 3), length units.
-        points: Solve on a fixed random subset of this many source and target particles; all of them where absent. A cloud
+        points: Solve on a fixed random subset of this many source and target particles; defaults to all of them. A cloud
             of fewer particles is used whole. Clouds of equal size share the subset, so that particles that correspond stay
             together.
         seed: Seed of the subset.

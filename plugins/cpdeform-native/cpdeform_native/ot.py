@@ -93,8 +93,8 @@ class OTSolverNative(OTSolver):
         warm_iterations: Most iterations of a warm call.
         warm_tolerance: L1 error of the source marginal at which a warm call stops iterating, as an iteration without
             over-relaxation would show it.
-        threads: Threads; those the process may use where absent.
-        instruction_set: ``"baseline"``, ``"avx2"`` or ``"avx512"``; the fastest that the processor has where absent.
+        threads: Threads; defaults to those the process may use.
+        instruction_set: ``"baseline"``, ``"avx2"`` or ``"avx512"``; defaults to the fastest that the processor has.
 
     Note:
         A blur far below the point spacing leaves the potentials of points that touch only their own copies nearly free. The

@@ -39,10 +39,10 @@ class SimulatorNative(SimulatorCheckpointing):
         batch_size: The most worlds that one call may hold.
         device: ``"cpu"``.
         dtype: `torch.float32` (default) or `torch.float64`; the tools' motion is always computed in float64.
-        threads: Threads; those the process may use where absent.
+        threads: Threads; defaults to those the process may use.
         memory_budget: Bytes that a rollout may keep for its way back. Where all substeps fit, none is computed twice; otherwise
             one checkpoint per environment step is kept and the inside recomputed.
-        instruction_set: ``"baseline"``, ``"avx2"`` or ``"avx512"``; the fastest that the processor has where absent.
+        instruction_set: ``"baseline"``, ``"avx2"`` or ``"avx512"``; defaults to the fastest that the processor has.
 
     Raises:
         CapabilityError: The device, type or a manipulator is not supported.
