@@ -246,6 +246,7 @@ class RunRecorder(Observer):
         try:
             yield
         except OSError as error:
+            self._lock.release()
             text = f"cannot write the run record in {self.directory}: {error.strerror or error}."
             raise RecordError(f"{text} {FULL_REMEDY}" if error.errno in FULL else text) from error
 
