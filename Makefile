@@ -26,7 +26,7 @@ endif
 quick: $(NATIVE)
 	$(BIN)/python -m pytest -m "not slow"
 
-# 12,000 damaged files and options, some minutes; `make test` tries a part of them.
+# 12,000 damaged files and options, killed and interrupted runs, full disks, some minutes; `make test` tries a part of them.
 faults: $(NATIVE)
 	$(BIN)/python -m pytest -m faults
 

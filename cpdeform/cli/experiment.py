@@ -154,9 +154,11 @@ def _run(name: str, given: dict[str, Any], *, resume: bool) -> tuple[Iterator[Ex
     from cpdeform.experiments.experiment import run_experiment
     from cpdeform.experiments.experiment_plan import planned_runs
     from cpdeform.experiments.experiment_row import without_directories
+    from cpdeform.run.record_files import check_directory
 
     registry = load_registry()
     settings = _settings(name, given, registry)
+    check_directory(settings.out, overwrite=True)
     runs = planned_runs(settings, registry=registry)
     command = without_directories(shlex.join(_command_line(name, given)))
     observe = _observer(settings, command, registry)

@@ -2,11 +2,14 @@
 
 ``run.json``
     Configuration, task, status, versions, machine; losses and metric once the run is over. A number that is not finite is
-    null. ``status`` is ``"running"`` until the run is over: a killed run keeps it. ``memory``: estimate and measured peak of
+    null. ``status`` is ``"running"`` until the run is over: a killed run keeps it. ``"interrupted"``: by the user; the last stage
+    then has that status, too, if it had a plan, and its state is that after the best plan so far. ``memory``: estimate and measured peak of
     the rollouts and gradients of the largest batch, bytes. ``resumed_from``: the record that the run went on from, or null; its
     stages go on counting, so that the first file is that of the stage after the other record's last one.
 ``metrics.jsonl``
     A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage.
+``.run.lock``
+    Number of the process that writes, while it does.
 ``target.h5``, ``stage-000.h5``, ...
     The goal, and each finished stage; the attributes of every dataset say what it holds.
 """
@@ -246,6 +249,7 @@ class RunRecorder(Observer):
         try:
             yield
         except OSError as error:
+            self._lock.release()
             text = f"cannot write the run record in {self.directory}: {error.strerror or error}."
             raise RecordError(f"{text} {FULL_REMEDY}" if error.errno in FULL else text) from error
 

@@ -30,10 +30,16 @@ class RecordLock:
         self._lock = FileLock(self._path, timeout=0, thread_local=False, is_singleton=True)
 
     def check(self) -> None:
-        """Raise `InputError` if another process has the lock; make no file."""
-        if self._path.exists():
+        """Raise `InputError` if another process has the lock, or it cannot be taken; make no file."""
+        if not os.path.lexists(self._path):
+            return
+        try:
             self._take()
-            self._lock.release()
+        except OSError as error:
+            came = f"a file {LOCK_FILE} that cannot be locked ({error.strerror or error})"
+            remedy = "Remove that file, or choose another directory with --out."
+            raise InputError(f"output directory {self._directory}", came=came, expected="a lock of a run", remedy=remedy) from error
+        self._lock.release()
 
     def acquire(self) -> None:
         """Take the lock, if this one does not have it yet.
