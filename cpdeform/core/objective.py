@@ -42,6 +42,15 @@ class Objective(abc.ABC):
                 scratch. It may speed up the evaluation, and changes its result within the objective's accuracy only.
         """
 
+    def losses(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> Tensor:
+        """Loss (B,) of each world without its gradient; defaults to `evaluate`, for an objective that has no quicker way.
+
+        Args:
+            trajectory: B worlds.
+            warm: As for `evaluate`.
+        """
+        return self.evaluate(trajectory, warm).loss
+
 
 class ObjectiveAutograd(Objective):
     """An objective written as a differentiable torch function; its gradient comes from autograd."""
@@ -49,6 +58,11 @@ class ObjectiveAutograd(Objective):
     @abc.abstractmethod
     def loss(self, positions: Tensor, manipulator_poses: Tensor) -> Tensor:
         """Loss (B,) of positions (B, T+1, N, 3), length units, and tool poses (B, T+1, M, 8)."""
+
+    def losses(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> Tensor:
+        """Loss (B,) alone."""
+        with torch.no_grad():
+            return self.loss(trajectory.positions.detach(), trajectory.manipulator_poses.detach())
 
     def evaluate(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> ObjectiveResult:
         """Loss and gradient by automatic differentiation of `loss`."""

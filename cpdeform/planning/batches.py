@@ -84,16 +84,18 @@ class Evaluator:
         # The gauge leaves out the objective, whose memory no estimate covers.
         with contextlib.nullcontext() if gauge is None else gauge.leave_out():
             asked = trajectory if bool(finite.all()) else _held(trajectory, batch.stand_ins, finite)
-            result = self.objective.evaluate(asked, batch.warm)
+            result = self.objective.evaluate(asked, batch.warm) if self.with_gradient else None
+            found = self.objective.losses(asked, batch.warm) if result is None else result.loss
         marks.append(time.perf_counter())
         gradient = None
-        if self.with_gradient:
+        if result is not None:
             gradient = self.simulator.vjp(trajectory, result.grad_positions, result.grad_manipulators).actions
         marks.append(time.perf_counter())
-        loss = torch.where(finite, result.loss.detach().double(), torch.nan).cpu()
+        loss = torch.where(finite, found.detach().double(), torch.nan).cpu()
         ends = trajectory.positions[:, -1].detach().clone()
         seconds = {name: marks[i + 1] - marks[i] for i, name in enumerate(("rollout", "objective", "vjp"))}
-        return Evaluation(loss, gradient, ends, result.warm, seconds, self._memory(batch, gauge))
+        warm = None if result is None else result.warm
+        return Evaluation(loss, gradient, ends, warm, seconds, self._memory(batch, gauge))
 
     def _memory(self, batch: Batch, gauge: MemoryGauge | None) -> MemoryUse | None:
         if gauge is None:

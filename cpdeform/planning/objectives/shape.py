@@ -73,6 +73,13 @@ class ObjectiveShape(Objective):
             warm=result.warm,
         )
 
+    def losses(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> Tensor:
+        """Loss (B,) of each world alone."""
+        transport = self._transport.losses(trajectory, warm)
+        with torch.no_grad():
+            misplaced = self._misplaced(trajectory.positions[:, -1].detach())
+        return transport / self._cost_start + (self._weight / self._misplaced_start) * misplaced.to(transport)
+
     def _misplaced(self, positions: Tensor) -> Tensor:
         """Misplaced share (B,) of the mass of positions (B, N, 3), the mean over the scales."""
         shares = [

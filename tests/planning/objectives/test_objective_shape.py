@@ -86,6 +86,11 @@ def test_warm_starts_are_those_of_the_transport() -> None:
     assert again.loss.tolist() == pytest.approx(first.loss.tolist(), rel=1e-3)
 
 
+def test_losses_alone_are_the_same() -> None:
+    whole, worlds = objective(), path(start(), start() + 0.3 * SHIFT)
+    assert torch.allclose(whole.losses(worlds), whole.evaluate(worlds).loss)
+
+
 def test_a_start_at_the_goal_is_refused() -> None:
     with pytest.raises(InputError, match="start: got the goal itself"):
         ObjectiveShape(ObjectiveTransport(solver(), start()), SCENE, start(), start())
