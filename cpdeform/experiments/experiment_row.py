@@ -22,7 +22,7 @@ from cpdeform.run.resume import recorded_configuration
 EVALUATION_FILE, FAILURE_FILE = "evaluation.json", "failure.json"
 """Files beside a record: its figures, so that they need not be computed again, and why there is no record."""
 
-OVER = frozenset(status.value for status in Status)
+OVER = frozenset(status.value for status in Status if status is not Status.INTERRUPTED)
 """Statuses of runs that came to an end of their own, with a plan or without."""
 
 FIGURES = (

@@ -1,11 +1,12 @@
 """The run record: a directory that holds all of a run, readable at any moment, also of a run that was killed.
 
 ``run.json``
-    Configuration, task, status, versions, machine; losses and metric once the run is over. A number that is not finite is null.
-    ``status`` is ``"running"`` until the run is over: a killed run keeps it. ``"interrupted"``: by the user; the last stage then
-    has that status, too, if it had a plan, and its state is that after the best plan so far. ``memory``: estimate and measured
-    peak of the rollouts and gradients of the largest batch, bytes. ``resumed_from``: the record that the run went on from, or
-    null; its stages go on counting, so that the first file is that of the stage after the other record's last one.
+    Configuration, task, status, versions, machine; losses and metric once the run is over. A number that is not finite is
+    null. ``status`` is ``"running"`` until the run is over: a killed run keeps it. ``"interrupted"``: by the user; the last
+    stage then has that status, too, if it had a plan, and its state is that after the best plan so far. ``memory``: estimate
+    and measured peak of the rollouts and gradients of the largest batch, bytes. ``resumed_from``: the record that the run
+    went on from, or null; its stages go on counting, so that the first file is that of the stage after the other record's
+    last one.
 ``metrics.jsonl``
     A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage.
 ``.run.lock``
