@@ -91,6 +91,10 @@ def rollout_arguments(dtype: type[np.floating[Any]]) -> Arguments:
     }
 
 
+OPTIONAL = ("grad_poses",)
+"""Arrays that may be None by themselves."""
+
+
 def vjp_arguments(dtype: type[np.floating[Any]], rollout: Arguments) -> Arguments:
     return {
         "actions": rollout["actions"],

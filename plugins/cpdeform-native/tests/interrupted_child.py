@@ -46,7 +46,7 @@ def gradient() -> Callable[[], object]:
 def transport(count: int, *, blur: float, threads: int) -> Callable[[], object]:
     generator = torch.Generator().manual_seed(0)
     source, target = (torch.rand(count, 3, generator=generator) for _ in range(2))
-    solver = OTSolverNative(blur=blur, tolerance=1e-12, iterations=10**9, threads=threads)
+    solver = OTSolverNative(blur=blur, tolerance=1e-12, iterations=10**6, threads=threads)
     return lambda: solver.solve(source, target)
 
 

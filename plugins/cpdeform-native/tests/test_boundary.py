@@ -105,7 +105,8 @@ def _changed(arguments: dict[str, Any], generator: np.random.Generator) -> tuple
         elif not isinstance(value, np.ndarray):
             changed[name] = cases.odd_number(generator)
         elif generator.random() < 0.5:
-            changed[name], broken = cases.broken_array(value, generator), True
+            changed[name] = cases.broken_array(value, generator)
+            broken |= changed[name] is not None or name not in cases.OPTIONAL
         else:
             changed[name] = cases.odd_values(value, generator)
     return changed, broken

@@ -130,8 +130,8 @@ class Simulator {
 
   void vjp(Checkpoints<Real>& checkpoints, In<Real> actions, In<Real> grad_positions, std::optional<In<Real>> grad_poses,
            std::optional<In<Real>> grad_last_velocity, std::optional<In<Real>> grad_last_affine,
-           std::optional<In<Real>> grad_last_strain, Out<double> grad_actions, Out<Real> grad_position, Out<Real> grad_velocity, Out<Real> grad_affine, Out<Real> grad_strain,
-           Out<double> grad_pose) {
+           std::optional<In<Real>> grad_last_strain, Out<double> grad_actions, Out<Real> grad_position, Out<Real> grad_velocity,
+           Out<Real> grad_affine, Out<Real> grad_strain, Out<double> grad_pose) {
     const Scene& s = shared_->scene;
     const int64_t worlds = checkpoints.worlds, steps = checkpoints.steps;
     const int64_t n = s.particle_count, tools = s.tool_count, numbers = s.action_size;
