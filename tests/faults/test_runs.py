@@ -10,11 +10,11 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from children import child_environment, interruptible_command, small_disk
-from click.testing import Result
 from toy_fixtures import write_toy_distribution, write_toy_task
 from typer.testing import CliRunner
 
@@ -53,7 +53,7 @@ def command(place: tuple[Path, Path], *arguments: object) -> subprocess.Complete
 
 
 @pytest.fixture
-def invoke(place, monkeypatch) -> Callable[..., Result]:
+def invoke(place, monkeypatch) -> Callable[..., Any]:
     """Calls the command in this process, which takes a tenth of the time of one of its own."""
     monkeypatch.chdir(place[0])
     monkeypatch.syspath_prepend(str(place[1]))
