@@ -12,6 +12,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
+from cpdeform.planning.interrupted import StageInterrupted
 from cpdeform.planning.objectives.shape import ObjectiveShape
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.phase import Phase
@@ -90,7 +91,11 @@ class StrategySculpt(Strategy):
         results: list[StageResult] = []
         state, warm, failures = start.state, None, 0
         for index in range(start.first_stage, start.first_stage + start.stages):
-            result = planner.stage(start, index, state, results, warm=warm)
+            try:
+                result = planner.stage(start, index, state, results, warm=warm)
+            except StageInterrupted as interruption:
+                yield interruption.result
+                raise
             results.append(result)
             yield result
             failures = 0 if result.status is Status.FINISHED else failures + 1
