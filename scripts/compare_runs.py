@@ -2,15 +2,14 @@
 
     .venv/bin/python scripts/compare_runs.py f60e65c
 
-Both revisions run in processes of their own on this machine, one thread each, the other one from a worktree in a temporary
-folder; the compiled extension is this checkout's. Runs before format 2 of the record had their settings in the task files; the
-strategy ``tuned`` has them now.
+Both revisions run in processes of their own on this machine, one thread each, the other one from a worktree in a temporary folder,
+with its own C++ plugin, which takes a minute or two to build. Runs before format 2 of the record had their settings in the task
+files; the strategy ``tuned`` has them now.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import os
 import subprocess
 import sys
@@ -18,6 +17,7 @@ import tempfile
 from pathlib import Path
 
 import h5py
+import numpy as np
 
 RUNS = {
     "writer": ("writer", "--iterations", "5"),
@@ -27,13 +27,20 @@ RUNS = {
     "move-v1": ("move-v1", "--iterations", "4"),
     "pinch": ("pinch", "--stages", "1", "--iterations", "4"),
 }
+NATIVE = "plugins/cpdeform-native"
 DATASETS = ("actions", "positions", "manipulator_poses", "placements/actions", "placements/loss", "placements/pose")
 STATE = ("position", "velocity", "affine", "elastic_strain", "manipulator_pose")
+WITHOUT_EDITABLE = (
+    "import runpy, sys; sys.meta_path[:] = [finder for finder in sys.meta_path if 'ScikitBuild' not in type(finder).__name__]; "
+    "sys.argv[0] = 'cpdeform'; runpy.run_module('cpdeform', run_name='__main__')"
+)
+"""Starts the command line without the finder of an editable C++ plugin, which would come before a folder on the path."""
+
 TUNED = "cpdeform/experiments/tuned.yaml"
 
 
 def main() -> int:
-    """Run both revisions and compare; exit code 1 where a number differs."""
+    """Run both revisions and compare; exit code 1 if a number differs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("revision", help="what to compare with, e.g. f60e65c")
     parser.add_argument("--runs", default=",".join(RUNS), help="names, separated by commas")
@@ -44,34 +51,48 @@ def main() -> int:
         other = Path(folder) / "other"
         subprocess.run(["git", "worktree", "add", "--quiet", "--detach", str(other), options.revision], cwd=here, check=True)
         try:
+            packages = {other: [other, built(other, Path(folder) / "site")], here: [here]}
             for name in options.runs.split(","):
-                digests = [run(name, root, Path(folder) / f"{number}-{name}") for number, root in enumerate((other, here))]
-                same = digests[0] == digests[1]
-                different += not same
-                sys.stdout.write(f"{name}: {'the same' if same else 'DIFFERENT'} in {len(digests[1])} arrays\n")
+                first, second = (run(name, root, paths, Path(folder)) for root, paths in packages.items())
+                lines = [key for key in first if not np.array_equal(first[key], second[key], equal_nan=True)]
+                largest = max((float(np.abs(first[key] - second[key]).max()) for key in lines), default=0.0)
+                told = f"DIFFERENT in {len(lines)}, by {largest:.2g} at most, of" if lines else "the same in all of"
+                different += bool(lines)
+                sys.stdout.write(f"{name}: {told} {len(first)} arrays\n")
                 sys.stdout.flush()
         finally:
             subprocess.run(["git", "worktree", "remove", "--force", str(other)], cwd=here, check=True)
     return 1 if different else 0
 
 
-def run(name: str, root: Path, out: Path) -> dict[str, str]:
-    """Run with the package of a worktree; returns a digest of each array of its record."""
-    command = [sys.executable, "-m", "cpdeform", "run", *RUNS[name], "--no-pictures", "--out", str(out)]
+def built(root: Path, site: Path) -> Path:
+    """Build a worktree's C++ plugin into a folder of its own; returns the folder."""
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-build-isolation", "--no-deps", "--target", str(site)]
+    tools = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    subprocess.run([*pip, str(root / NATIVE)], check=True, env={**os.environ, "PATH": tools})
+    return site
+
+
+def run(name: str, root: Path, paths: list[Path], folder: Path) -> dict[str, np.ndarray]:
+    """Run with the packages of a worktree; returns the arrays of its record."""
+    out = folder / f"{root.name}-{name}"
+    start = ["-m", "cpdeform"] if len(paths) == 1 else ["-c", WITHOUT_EDITABLE]
+    command = [sys.executable, *start, "run", *RUNS[name], "--no-pictures", "--out", str(out)]
     if (root / TUNED).is_file():
         command += ["--strategy", "tuned"]
-    environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-    subprocess.run(command, cwd=out.parent, env=environment, check=True, capture_output=True)
-    return digests(out)
+    path = os.pathsep.join(map(str, paths))
+    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True)
+    return arrays(out)
 
 
-def digests(record: Path) -> dict[str, str]:
-    """A digest of every array that a plan consists of."""
+def arrays(record: Path) -> dict[str, np.ndarray]:
+    """Every array that a plan consists of."""
     found = {}
     for path in sorted(record.glob("stage-*.h5")):
         with h5py.File(path, "r") as file:
             for name in (*DATASETS, *(f"state/{field}" for field in STATE)):
-                found[f"{path.name}/{name}"] = hashlib.sha256(file[name][()].tobytes()).hexdigest()
+                found[f"{path.name}/{name}"] = file[name][()]
     return found
 
 
