@@ -15,6 +15,7 @@ import pytest
 COMMAND = (
     "import signal, sys\n"
     "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
     "from cpdeform.cli.main import main\n"
     "sys.argv[0] = 'cpdeform'\n"
     "main()\n"
@@ -22,9 +23,9 @@ COMMAND = (
 
 
 def interruptible_command(arguments: Sequence[str]) -> list[str]:
-    """The command line's arguments as a child's, which control-C interrupts even where its parent ignores it.
+    """The command line's arguments as a child's, which control-C and SIGHUP interrupt even where its parent ignores them.
 
-    What a script starts in the background ignores the signal, and children inherit that: Python then installs no handler.
+    What a script starts in the background ignores the first, what `nohup` starts the second, and children inherit that.
     """
     return [sys.executable, "-c", COMMAND, *arguments]
 
