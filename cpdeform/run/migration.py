@@ -20,14 +20,14 @@ def current_configuration(content: Mapping[str, Any], *, record_format: int) -> 
     if record_format >= 2:
         return result
     if "algorithm" in result:
-        result["strategy"] = {"paper": "paper"}.get(result.pop("algorithm"), "cpdeform")
+        result["strategy"] = "paper" if result.pop("algorithm") == "paper" else "cpdeform"
     optimizer = result.get("optimizer")
     if isinstance(optimizer, dict) and "schedule" in optimizer:
         rest = {key: value for key, value in optimizer.items() if key != "schedule"}
-        result["optimizer"] = {**rest, "pruner": {"paper": "none"}.get(optimizer["schedule"], optimizer["schedule"])}
+        result["optimizer"] = {**rest, "pruner": "none" if optimizer["schedule"] == "paper" else optimizer["schedule"]}
     options = result.get("placer_options")
     if isinstance(options, dict):
-        names = PLACER_OPTIONS.get(result.get("placer", "transport"), {})
+        names = PLACER_OPTIONS.get(str(result.get("placer", "transport")), {})
         result["placer_options"] = {names.get(key, key): value for key, value in options.items()}
     return result
 

@@ -24,6 +24,9 @@ from cpdeform.run.migration import current_task
 from cpdeform.run.record_files import METRICS_FILE, RUN_FILE, TARGET_FILE, stage_files
 from cpdeform.run.record_stage import read_stage
 
+MOST_FORMAT = 1000
+"""Largest number of a format that a later version may have."""
+
 MOST_BYTES = 2**32
 """Bytes of a stage that a record's task alone does not allow for."""
 
@@ -142,6 +145,7 @@ class RunFields(BaseModel):
 
     model_config = ConfigDict(extra="allow", strict=True)
 
+    format: int = Field(default=1, ge=1, le=MOST_FORMAT)
     status: str
     advice: str = ""
     names: dict[str, str] = Field(default_factory=dict)

@@ -264,3 +264,22 @@ def test_records_of_the_first_format_are_read(tmp_path, task, toy_entry_points):
 def test_a_blur_next_to_nothing_is_refused(section, registry):
     with pytest.raises(InputError, match=rf"{section}\.blur: got 1e-30, expected .* 0\.000001"):
         resolve({section: {"blur": 1e-30}}, registry=registry)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"format": [2]},
+        {"format": "2"},
+        {"format": 0},
+        {"format": 1, "configuration": {"algorithm": ["paper"], "optimizer": {"schedule": ["paper"]}, "placer": {"a": 1}}},
+        {"format": 1, "configuration": {"placer_options": {"poses": 3}, "placer": ["transport"]}},
+    ],
+)
+def test_a_damaged_record_of_any_format_is_one_error(tmp_path, task, toy_entry_points, changes):
+    toys = load_registry(toy_entry_points)
+    deform(task, settings={**TOYS, "optimizer": {"iterations": 2}}, stages=1, registry=toys).save(tmp_path / "run")
+    file = tmp_path / "run" / "run.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    with pytest.raises(InputError):
+        resolve({}, record=load_record(tmp_path / "run"), registry=toys)
