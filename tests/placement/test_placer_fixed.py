@@ -30,7 +30,7 @@ def test_tools_stay_even_in_collision() -> None:
 
 def test_registered_placers_exist() -> None:
     specs = cpdeform_placers()
-    assert [spec.name for spec in specs] == ["transport", "fixed", "random"]
+    assert [spec.name for spec in specs] == ["transport", "touch", "fixed", "random"]
     for spec in specs:
         module, attribute = spec.target.split(":")
         assert issubclass(getattr(importlib.import_module(module), attribute), Placer)
