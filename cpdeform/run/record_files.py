@@ -50,6 +50,10 @@ def _is_own(name: str) -> bool:
     return plain in OWN_FILES or STAGE_PATTERN.fullmatch(plain) is not None
 
 
+ATTEMPTS_TO_WRITE = 10
+"""How often a directory is made that another process removes at the same moment."""
+
+
 def check_directory(directory: Path, *, overwrite: bool) -> None:
     """Check that a record can be written, and leave the file system as it was.
 
@@ -78,19 +82,31 @@ def check_directory(directory: Path, *, overwrite: bool) -> None:
 
 
 def _try_writing(directory: Path) -> None:
-    """Make the directory and a file in it, then remove both; permission bits alone do not tell (root, read-only mounts)."""
+    """Make the directory and a file in it, then remove both; permission bits alone do not tell (root, read-only mounts).
+
+    Other processes may make or remove the same directories at the same time.
+    """
+    for _ in range(ATTEMPTS_TO_WRITE - 1):
+        with contextlib.suppress(FileNotFoundError):
+            return _try_writing_once(directory)
+    return _try_writing_once(directory)
+
+
+def _try_writing_once(directory: Path) -> None:
     missing = [path for path in (directory, *directory.parents) if not path.exists()]
     made: list[Path] = []
     try:
         for path in reversed(missing):
-            path.mkdir()
-            made.append(path)
+            with contextlib.suppress(FileExistsError):
+                path.mkdir()
+                made.append(path)
         # A name of its own: an existing one may be a link to a file elsewhere.
         with tempfile.TemporaryFile(dir=directory):
             pass
     finally:
         for path in reversed(made):
-            path.rmdir()
+            with contextlib.suppress(OSError):
+                path.rmdir()
 
 
 @contextlib.contextmanager
