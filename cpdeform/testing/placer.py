@@ -14,6 +14,7 @@ from torch import Tensor
 from cpdeform.core.errors import CpdeformError
 from cpdeform.core.ot import OTResult
 from cpdeform.core.placer import Candidate, Placer, Proposal, Stage
+from cpdeform.core.priorities import DISPLACEMENT_EXPONENT
 from cpdeform.core.scene import Scene
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
@@ -51,10 +52,11 @@ def _is_current(placement: Proposal, stage: Stage) -> bool:
     return placement.pose.shape == pose.shape and torch.allclose(placement.pose.to(pose), pose, atol=1e-7)
 
 
-def make_stage(*, dtype: torch.dtype = torch.float64, fixed: bool = False, **changes: Any) -> Stage:
+def make_stage(placer: Placer | None = None, *, dtype: torch.dtype = torch.float64, fixed: bool = False, **changes: Any) -> Stage:
     """A block on the floor whose priorities are largest near one end of its top, and a movable ball above it.
 
     Args:
+        placer: The stage's transport is the solution of its problem, if it declares one; defaults to potentials.
         dtype: Type of the state.
         fixed: Whether a fixed ball comes before and after the movable one in the order of the tools.
         changes: Fields of the movable ball.
@@ -77,7 +79,12 @@ def make_stage(*, dtype: torch.dtype = torch.float64, fixed: bool = False, **cha
     priorities = 0.02 * torch.exp(-((distance / 0.03) ** 2))
     priorities = priorities - priorities.median()
     target = state.position[0] - torch.tensor([0.0, 0.01, 0.0]).to(state.position)
-    return Stage(0, scene, state, target, transport_of(priorities), torch.Generator().manual_seed(0))
+    problem = None if placer is None else placer.transport_problem
+    displacements = None
+    if problem is not None and problem.exponent == DISPLACEMENT_EXPONENT:
+        displacements = priorities.clamp(min=0.0)[:, None] * torch.tensor([0.0, -1.0, 0.0]).to(priorities)
+    transport = transport_of(priorities, displacements)
+    return Stage(0, scene, state, target, transport, torch.Generator().manual_seed(0))
 
 
 def transport_of(priorities: Tensor, displacements: Tensor | None = None) -> OTResult:
@@ -134,7 +141,7 @@ def check_collision(bench: PlacerBench) -> Finding:
     """How deep a tool reaches into the body."""
     depths = []
     for dtype in (torch.float64, torch.float32):
-        stage = make_stage(dtype=dtype)
+        stage = make_stage(bench.make(), dtype=dtype)
         depths += [-_gap(item, stage) for item in bench.make().ask(stage)]
     return Finding(max(depths, default=0.0), 1e-6)
 
@@ -153,7 +160,7 @@ def check_bounds(bench: PlacerBench) -> Finding:
 
 def check_fixed_tools(bench: PlacerBench) -> Finding:
     """Tools that no action moves stay where they are."""
-    stage = make_stage(fixed=True)
+    stage = make_stage(bench.make(), fixed=True)
     current, moved = stage.state.manipulator_pose[0], [0.0]
     for item in bench.make().ask(stage):
         for index, tool in enumerate(stage.scene.manipulators):
@@ -180,7 +187,7 @@ def check_reproducible(bench: PlacerBench) -> Finding:
 
 def check_stage_untouched(bench: PlacerBench) -> Finding:
     """State, target and priorities are as they were."""
-    stage = make_stage()
+    stage = make_stage(bench.make())
     kept = [tensor.clone() for tensor in _tensors(stage)]
     bench.make().ask(stage)
     changed = [not torch.equal(now, before) for now, before in zip(_tensors(stage), kept, strict=True)]
@@ -196,7 +203,7 @@ def check_impossible(bench: PlacerBench) -> Finding:
     if bench.stays:
         raise Skip("It leaves the tools where they are.")
     inside = (0.5, 0.06, 0.5)
-    stage = make_stage(position=inside, lower_bound=inside, upper_bound=inside)
+    stage = make_stage(bench.make(), position=inside, lower_bound=inside, upper_bound=inside)
     return Finding(float(len(bench.make().ask(stage))), 0.0)
 
 
@@ -261,13 +268,13 @@ def check_placer(placer: Placer | Callable[[], Placer], *, only: Sequence[str] =
     """
     items = choose(PLACER_CHECKS, only)
     name = type(placer).__name__ if isinstance(placer, Placer) else str(getattr(placer, "__name__", type(placer).__name__))
-    stage = make_stage()
     try:
         make: Callable[[], Placer] = (lambda: copy.deepcopy(placer)) if isinstance(placer, Placer) else placer
         made = make()
         if not isinstance(made, Placer):
             raise TypeError(f"it is a {type(made).__name__}, not a cpdeform.core.placer.Placer")
         name = type(made).__name__
+        stage = make_stage(made)
         bench = PlacerBench(make, stage, list(made.ask(reseeded(stage))))
     except Exception as error:
         advice = f"Building it and asking it for placements raised {type(error).__name__}: {error}"
