@@ -11,7 +11,7 @@ OUT ?= runs/first
 
 SANITIZED := plugins/cpdeform-native/build/sanitized
 
-.PHONY: run test quick faults lint targets sanitize clean
+.PHONY: run test quick faults lint goals sanitize clean
 
 run: $(NATIVE)
 	$(BIN)/cpdeform run writer --out $(OUT) --overwrite
@@ -38,10 +38,10 @@ lint: $(INSTALLED)
 	cd plugins/cpdeform-native && ../../$(BIN)/mypy
 
 # All 53 take two minutes with the native simulator, which is why it is built first; six times as long with Warp.
-# `make targets TARGETS="star move-v2"` checks some of them.
-TARGETS ?=
-targets: $(NATIVE)
-	$(BIN)/python -m cpdeform.tasks.make_targets --check $(TARGETS)
+# `make goals GOALS="star move-v2"` checks some of them.
+GOALS ?=
+goals: $(NATIVE)
+	$(BIN)/python -m cpdeform.tasks.make_goals --check $(GOALS)
 
 # The C++ code under AddressSanitizer and UndefinedBehaviorSanitizer: arguments of all sorts, right and wrong, and a few rollouts,
 # gradients and transports. Python is not built with them, so their runtime has to be loaded first; what Python never frees is no leak.

@@ -20,7 +20,7 @@ from cpdeform.core.plugins import load_registry
 
 BODY = {"kind": "box", "position": (0.5, 0.06, 0.5), "widths": (0.12, 0.1, 0.12), "particle_count": 500}
 TOOL = {"kind": "Box", "half_extents": (0.02, 0.05, 0.08), "position": (0.40, 0.08, 0.5), "action_scale": (0.02, 0.0, 0.0)}
-SCENE = Scene.model_validate({"bodies": [BODY], "manipulators": [TOOL], "grid_size": 32, "substeps": 10, "ground_friction": 0.5})
+SCENE = Scene.model_validate({"bodies": [BODY], "tools": [TOOL], "grid_size": 32, "substeps": 10, "ground_friction": 0.5})
 SHIFTS = (0.01, 0.02, 0.03, 0.04)
 """How far the clay is to go along x, one number a world, length units."""
 
@@ -40,7 +40,7 @@ class Policy(torch.nn.Module):
 
     def forward(self, state: State, wanted: Tensor) -> Tensor:
         """Actions (B, 3), in [-1, 1], from a state and the wanted place (B,) of the clay's centre along x."""
-        centre, tool = state.position[..., 0].mean(dim=1), state.manipulator_pose[:, 0, 0]
+        centre, tool = state.position[..., 0].mean(dim=1), state.tool_pose[:, 0, 0]
         seen = torch.stack([wanted - centre, centre - tool], dim=-1) / LENGTH
         push = torch.tanh(self.linear(seen))
         return torch.cat([push, torch.zeros_like(push), torch.zeros_like(push)], dim=-1)

@@ -28,8 +28,8 @@ RUNS = {
     "pinch": ("pinch", "--stages", "1", "--iterations", "4"),
 }
 NATIVE = "plugins/cpdeform-native"
-DATASETS = ("actions", "positions", "manipulator_poses", "placements/actions", "placements/loss", "placements/pose")
-STATE = ("position", "velocity", "affine", "elastic_strain", "manipulator_pose")
+DATASETS = ("actions", "positions", "tool_poses", "placements/actions", "placements/loss", "placements/pose")
+STATE = ("position", "velocity", "affine", "elastic_strain", "tool_pose")
 WITHOUT_EDITABLE = (
     "import runpy, sys; sys.meta_path[:] = [finder for finder in sys.meta_path if 'ScikitBuild' not in type(finder).__name__]; "
     "sys.argv[0] = 'cpdeform'; runpy.run_module('cpdeform', run_name='__main__')"

@@ -38,8 +38,8 @@ def changed_final(change):
 def changed_gradient(change):
     """A Warp simulator whose gradients go through ``change(gradient, trajectory)``."""
 
-    def vjp(self, trajectory, grad_positions, grad_manipulators=None, *, grad_final_state=None):
-        gradient = SimulatorWarp.vjp(self, trajectory, grad_positions, grad_manipulators, grad_final_state=grad_final_state)
+    def vjp(self, trajectory, grad_positions, grad_tools=None, *, grad_final_state=None):
+        gradient = SimulatorWarp.vjp(self, trajectory, grad_positions, grad_tools, grad_final_state=grad_final_state)
         return change(gradient, trajectory)
 
     return type("SimulatorBroken", (SimulatorWarp,), {"vjp": vjp})

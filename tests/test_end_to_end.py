@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from cpdeform import Scene, TrajectoryOptimizer, deform, load_task
 from cpdeform.backends.warp.simulator import SimulatorWarp
 from cpdeform.cli.main import app
-from cpdeform.core.target import write_target
+from cpdeform.core.goal import write_goal
 from cpdeform.ot.geomloss import OTSolverGeomLoss
 from cpdeform.ot.pot import OTSolverPOT
 from cpdeform.planning.result import Status
@@ -25,7 +25,7 @@ from cpdeform.tasks.scripts import Leg, perform
 README = Path(__file__).resolve().parents[1] / "README.md"
 SCENE: dict[str, Any] = {
     "bodies": [{"kind": "box", "position": [0.5, 0.08, 0.5], "widths": [0.4, 0.16, 0.4], "particle_count": 1200}],
-    "manipulators": [
+    "tools": [
         {
             "kind": "Capsule",
             "radius": 0.06,
@@ -46,9 +46,9 @@ STROKE = (Leg(3, {0: (0.0, -1.0, 0.0)}, {0: (0.38, 0.271, 0.62)}), Leg(2, {0: (0
 def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Task file of a small board with a stroke away from the pen's start."""
     folder = tmp_path_factory.mktemp("board")
-    write_target(folder / "target.npz", perform(STROKE, SimulatorWarp(Scene.model_validate(SCENE), dtype=torch.float64)))
+    write_goal(folder / "goal.npz", perform(STROKE, SimulatorWarp(Scene.model_validate(SCENE), dtype=torch.float64)))
     path = folder / "board.yaml"
-    content = {"name": "board", "scene": SCENE, "target": "target.npz", "step_count": 5, "metric": "incremental_iou"}
+    content = {"name": "board", "scene": SCENE, "goal": "goal.npz", "step_count": 5, "metric": "incremental_iou"}
     path.write_text(yaml.safe_dump(content))
     return path
 
@@ -111,9 +111,9 @@ def test_the_pen_is_put_over_the_stroke(board: Path) -> None:
 def test_solvers_agree_on_the_priorities(board: Path) -> None:
     task = load_task(board)
     source = SimulatorWarp(task.scene).initial_state().position[0]
-    target = torch.as_tensor(task.load_target()).float()
+    goal = torch.as_tensor(task.load_goal()).float()
     first, second = OTSolverPOT(blur=5e-3), OTSolverGeomLoss(blur=5e-3)
-    one, other = first.solve(source, target).source_potential, second.solve(source, target).source_potential
+    one, other = first.solve(source, goal).source_potential, second.solve(source, goal).source_potential
     tolerance = first.capabilities.potential_tolerance + second.capabilities.potential_tolerance
     assert (one - other).abs().max() <= tolerance * (other.max() - other.min())
     assert int(one.argmax()) == int(other.argmax())

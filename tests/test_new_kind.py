@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from toy_cone import ManipulatorCone, SceneWithCones
+from toy_cone import SceneWithCones, ToolCone
 
 from cpdeform.backends.scene_numbers import tool_numbers
 from cpdeform.core.errors import CapabilityError, InputError, MissingExtraError
@@ -20,16 +20,16 @@ from cpdeform.report.render import fit_camera, render
 from cpdeform.report.shapes import tool_surface
 from cpdeform.testing.placer import transport_of
 
-CONE = ManipulatorCone(position=(0.5, 0.4, 0.5), radius=0.05, height=0.12, action_scale=(0.01, 0.01, 0.01))
+CONE = ToolCone(position=(0.5, 0.4, 0.5), radius=0.05, height=0.12, action_scale=(0.01, 0.01, 0.01))
 BODY = {"kind": "box", "position": (0.5, 0.1, 0.5), "widths": (0.2, 0.1, 0.2), "particle_count": 500}
 
 
 def make_scene() -> SceneWithCones:
-    return SceneWithCones.model_validate({"bodies": [BODY], "manipulators": [CONE.model_dump()]})
+    return SceneWithCones.model_validate({"bodies": [BODY], "tools": [CONE.model_dump()]})
 
 
 def test_distance_and_half_extents() -> None:
-    (pose,) = initial_state(make_scene(), dtype=torch.float64).manipulator_pose[0]
+    (pose,) = initial_state(make_scene(), dtype=torch.float64).tool_pose[0]
     points = torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.3, 0.5], [0.6, 0.34, 0.5], [0.5, 0.35, 0.5]], dtype=torch.float64)
     assert signed_distance(CONE, pose, points).tolist() == pytest.approx([0.04, 0.04, 0.05, -0.01])
     # Half a turn about z: the axes change their directions only.
@@ -68,21 +68,21 @@ def test_simulators_that_lack_it_say_so(name: str) -> None:
         simulator = registry.load("simulator", name)
     except MissingExtraError as error:
         pytest.skip(str(error))
-    with pytest.raises(CapabilityError, match=r"has no manipulator of kind Cone \(manipulators\.0\); it has Sphere, Capsule"):
+    with pytest.raises(CapabilityError, match=r"has no tool of kind Cone \(tools\.0\); it has Sphere, Capsule"):
         simulator(make_scene())
 
 
 def test_kernels_have_no_number_for_it() -> None:
-    with pytest.raises(InputError, match=r"manipulator: got one of kind Cone, expected a kind that kernels have a number for: Sph"):
+    with pytest.raises(InputError, match=r"tool: got one of kind Cone, expected a kind that kernels have a number for: Sph"):
         tool_numbers(make_scene())
 
 
 def test_tutorial_backend_does_not_take_it_for_another() -> None:
     shapes = pytest.importorskip("cpdeform_example.shapes")
-    with pytest.raises(InputError, match="manipulator: got ManipulatorCone, expected one of the kinds Sphere"):
+    with pytest.raises(InputError, match="tool: got ToolCone, expected one of the kinds Sphere"):
         shapes.distance_and_normal(CONE, torch.zeros(2, 3), torch.zeros(2, 1))
 
 
 def test_a_scene_that_does_not_list_it_refuses_it() -> None:
     with pytest.raises(ValueError, match="Cone"):
-        Scene.model_validate({"bodies": [BODY], "manipulators": [CONE.model_dump()]})
+        Scene.model_validate({"bodies": [BODY], "tools": [CONE.model_dump()]})

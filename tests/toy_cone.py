@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from cpdeform.core.model import PositiveFloat
-from cpdeform.core.scene import Manipulator, Scene
+from cpdeform.core.scene import Scene, Tool
 from cpdeform.core.shapes.base import Array, Shape
 from cpdeform.core.shapes.lengths import along_and_across, length
-from cpdeform.core.shapes.manipulator import ManipulatorBase
 from cpdeform.core.shapes.meshes import revolve
+from cpdeform.core.shapes.tool import ToolBase
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -50,7 +50,7 @@ class ShapeCone(Shape):
         return math.pi / 3.0 * self.radius**2 * self.height
 
 
-class ManipulatorCone(ManipulatorBase):
+class ToolCone(ToolBase):
     kind: Literal["Cone"] = "Cone"
     radius: PositiveFloat
     height: PositiveFloat
@@ -66,4 +66,4 @@ class ManipulatorCone(ManipulatorBase):
 class SceneWithCones(Scene):
     """What an entry in the list of `cpdeform.core.shapes.kinds` does for `Scene`."""
 
-    manipulators: tuple[Manipulator | ManipulatorCone, ...] = ()
+    tools: tuple[Tool | ToolCone, ...] = ()

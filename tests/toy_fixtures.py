@@ -37,17 +37,17 @@ def toy_entry_points() -> list[importlib.metadata.EntryPoint]:
 
 
 def write_toy_task(directory: Path, *, offset: float = 0.1, **fields: object) -> Path:
-    """Write a task file with its target: a ball, to be shifted by `offset` along x."""
+    """Write a task file with its goal: a ball, to be shifted by `offset` along x."""
     from cpdeform.core.sampling import sample_particles
     from cpdeform.core.scene import Scene
 
     scene = {
         "bodies": [{"kind": "sphere", "position": [0.4, 0.4, 0.4], "radius": 0.1, "particle_count": 60}],
-        "manipulators": [{"kind": "Sphere", "radius": 0.05, "position": [0.4, 0.7, 0.4], "action_scale": [0.02, 0.02, 0.02]}],
+        "tools": [{"kind": "Sphere", "radius": 0.05, "position": [0.4, 0.7, 0.4], "action_scale": [0.02, 0.02, 0.02]}],
     }
-    target = sample_particles(Scene.model_validate(scene)) + np.array([offset, 0.0, 0.0])
-    np.savez(directory / "target.npz", position=target)
-    task = {"name": "shift", "scene": scene, "target": "target.npz", "step_count": 5, "stage_count": 2, **fields}
+    goal = sample_particles(Scene.model_validate(scene)) + np.array([offset, 0.0, 0.0])
+    np.savez(directory / "goal.npz", position=goal)
+    task = {"name": "shift", "scene": scene, "goal": "goal.npz", "step_count": 5, "stage_count": 2, **fields}
     path = directory / "shift.yaml"
     path.write_text(yaml.safe_dump(task))
     return path

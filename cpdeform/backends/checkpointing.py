@@ -27,7 +27,7 @@ class SimulatorCheckpointing(Simulator):
             one checkpoint per environment step is kept and the inside recomputed.
 
     Raises:
-        CapabilityError: The device, type or a manipulator is not supported.
+        CapabilityError: The device, type or a tool is not supported.
         InputError: An option is out of range.
     """
 
@@ -50,7 +50,7 @@ class SimulatorCheckpointing(Simulator):
         return tensor.detach().to(device=self.device, dtype=self.dtype, copy=True, memory_format=torch.contiguous_format)
 
     def _incoming(
-        self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None, grad_final_state: State | None
+        self, trajectory: Trajectory, grad_positions: Tensor, grad_tools: Tensor | None, grad_final_state: State | None
     ) -> tuple[Tensor, Tensor | None, State | None]:
         """What `vjp` was given, on the simulator's device and in its type.
 
@@ -63,17 +63,17 @@ class SimulatorCheckpointing(Simulator):
             InputError: They do not fit the trajectory, or it cannot be gone back.
         """
         self._check_gradient(trajectory, grad_positions)
-        if grad_manipulators is not None and grad_manipulators.shape != trajectory.manipulator_poses.shape:
-            came, expected = (f"shape {tuple(like.shape)}" for like in (grad_manipulators, trajectory.manipulator_poses))
-            raise InputError("grad_manipulators", came=came, expected=expected)
+        if grad_tools is not None and grad_tools.shape != trajectory.tool_poses.shape:
+            came, expected = (f"shape {tuple(like.shape)}" for like in (grad_tools, trajectory.tool_poses))
+            raise InputError("grad_tools", came=came, expected=expected)
         check_final_gradient(trajectory, grad_final_state)
         positions = grad_positions.detach().to(device=self.device, dtype=self.dtype)
-        poses = None if grad_manipulators is None else grad_manipulators.detach().to(device=self.device, dtype=self.dtype)
+        poses = None if grad_tools is None else grad_tools.detach().to(device=self.device, dtype=self.dtype)
         if grad_final_state is None:
             return positions, poses, None
         final = grad_final_state.map(self._own)
         final.elastic_strain[..., 3:] *= 0.5
-        return *add_final_gradient(trajectory, positions, poses, final.position, final.manipulator_pose), final
+        return *add_final_gradient(trajectory, positions, poses, final.position, final.tool_pose), final
 
     def _check_gradient(self, trajectory: Trajectory, grad_positions: Tensor) -> None:
         """Raise `InputError` unless a trajectory can be gone back and the gradient fits it."""

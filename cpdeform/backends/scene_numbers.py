@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.sampling import body_index
-from cpdeform.core.scene import WALL_NODES, Manipulator, Scene, Vector3
-from cpdeform.core.shapes.kinds import MANIPULATORS
+from cpdeform.core.scene import WALL_NODES, Scene, Tool, Vector3
+from cpdeform.core.shapes.kinds import TOOLS
 
-KIND_NUMBERS = {kind: number for number, kind in enumerate(MANIPULATORS)}
-"""Numbers of the manipulator kinds inside kernels."""
+KIND_NUMBERS = {kind: number for number, kind in enumerate(TOOLS)}
+"""Numbers of the tool kinds inside kernels."""
 
 SPHERE, CAPSULE, BOX = KIND_NUMBERS["Sphere"], KIND_NUMBERS["Capsule"], KIND_NUMBERS["Box"]
 CYLINDER, TORUS = KIND_NUMBERS["Cylinder"], KIND_NUMBERS["Torus"]
@@ -40,7 +40,7 @@ class SceneNumbers:
         upper: Positions are clipped to stay below this corner, length units.
         grid_size: Nodes along each axis.
         ground_nodes: Nodes below this number are the floor's boundary layer.
-        tool_count: Number of manipulators.
+        tool_count: Number of tools.
     """
 
     time_step: float
@@ -60,7 +60,7 @@ class SceneNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class ToolNumbers:
-    """Constants of a manipulator.
+    """Constants of a tool.
 
     Attributes:
         kind: One of `KIND_NUMBERS`.
@@ -83,27 +83,27 @@ class ToolNumbers:
     upper: Vector3
 
 
-def kind_number(manipulator: Manipulator) -> int:
+def kind_number(tool: Tool) -> int:
     """The number of a tool's kind inside kernels.
 
     Raises:
         InputError: The kind is not in the list of `cpdeform.core.shapes.kinds`.
     """
-    if manipulator.kind not in KIND_NUMBERS:
+    if tool.kind not in KIND_NUMBERS:
         expected = f"a kind that kernels have a number for: {', '.join(KIND_NUMBERS)}"
-        raise InputError("manipulator", came=f"one of kind {manipulator.kind}", expected=expected)
-    return KIND_NUMBERS[manipulator.kind]
+        raise InputError("tool", came=f"one of kind {tool.kind}", expected=expected)
+    return KIND_NUMBERS[tool.kind]
 
 
-def tool_size(manipulator: Manipulator) -> tuple[float, ...]:
-    """The lengths that a manipulator's signed distance depends on, see `ManipulatorBase.kernel_lengths`, padded to four.
+def tool_size(tool: Tool) -> tuple[float, ...]:
+    """The lengths that a tool's signed distance depends on, see `ToolBase.kernel_lengths`, padded to four.
 
     Raises:
         InputError: There are more.
     """
-    lengths = manipulator.kernel_lengths
+    lengths = tool.kernel_lengths
     if len(lengths) > MOST_LENGTHS:
-        raise InputError(f"{manipulator.kind}.kernel_lengths", came=f"{len(lengths)} lengths", expected=f"at most {MOST_LENGTHS}")
+        raise InputError(f"{tool.kind}.kernel_lengths", came=f"{len(lengths)} lengths", expected=f"at most {MOST_LENGTHS}")
     return (*lengths, *[0.0] * (MOST_LENGTHS - len(lengths)))
 
 
@@ -125,28 +125,28 @@ def scene_numbers(scene: Scene) -> SceneNumbers:
         grid_size=scene.grid_size,
         # whole nodes: PlasticineLab truncates the ground height to its grid
         ground_nodes=WALL_NODES + int(scene.ground_height / distance),
-        tool_count=len(scene.manipulators),
+        tool_count=len(scene.tools),
     )
 
 
 def tool_numbers(scene: Scene) -> list[ToolNumbers]:
-    """The constants of a scene's manipulators."""
+    """The constants of a scene's tools."""
     tools, offset = [], 0
-    for manipulator in scene.manipulators:
-        scale = [value / scene.substeps for value in manipulator.action_scale]
+    for tool in scene.tools:
+        scale = [value / scene.substeps for value in tool.action_scale]
         tools.append(
             ToolNumbers(
-                kind=kind_number(manipulator),
-                size=tool_size(manipulator),
-                friction=manipulator.friction,
+                kind=kind_number(tool),
+                size=tool_size(tool),
+                friction=tool.friction,
                 action_offset=offset,
-                action_size=manipulator.action_size,
+                action_size=tool.action_size,
                 scale=(*scale, *[0.0] * (7 - len(scale))),
-                lower=manipulator.lower_bound,
-                upper=manipulator.upper_bound,
+                lower=tool.lower_bound,
+                upper=tool.upper_bound,
             )
         )
-        offset += manipulator.action_size
+        offset += tool.action_size
     return tools
 
 

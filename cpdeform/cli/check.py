@@ -99,7 +99,7 @@ def check_golden_command(
     scenes: Annotated[
         Path | None, typer.Option(help="Scene definitions.  [default: DIR/../plasticinelab/scenes.json]", metavar="FILE")
     ] = None,
-    targets: Annotated[
+    goals: Annotated[
         Path | None, typer.Option(help="Target grids.  [default: DIR/../plasticinelab/target_grids.npz]", metavar="FILE")
     ] = None,
     device: Device = "cpu",
@@ -130,7 +130,7 @@ def check_golden_command(
     for name, path in itertools.product(names, golden_files(directory)):
         factory = functools.partial(simulators[name], **split_options(settings or []))
         with _quietly(as_json):
-            result = check_golden_file(path, factory, scenes=scenes, targets=targets, device=device, dtype=real)
+            result = check_golden_file(path, factory, scenes=scenes, goals=goals, device=device, dtype=real)
         results[name].append(result)
         prefix = f"{name:<10}" if len(names) > 1 else ""
         typer.echo(json.dumps(_plain(name, result)) if as_json else f"{prefix}{result}")

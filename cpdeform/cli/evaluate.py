@@ -51,9 +51,9 @@ def evaluate(
 
 def _text(result: Evaluation) -> str:
     lines = [
-        f"{result.task}: {result.particle_count} particles, {result.target_count} in the goal",
+        f"{result.task}: {result.particle_count} particles, {result.goal_count} in the goal",
         f"  incremental IoU  {result.incremental_iou:.4f}   (IoU {result.iou_start:.4f} -> {result.iou_final:.4f}, at most "
-        f"{result.iou_target:.4f}; the goal's node masses from its {result.grid})",
+        f"{result.iou_goal:.4f}; the goal's node masses from its {result.grid})",
         f"  Wasserstein-1    {_change(result.wasserstein_start, result.wasserstein_final)}   (debiased, blur "
         f"{result.wasserstein_blur:g}, {'' if result.converged else 'NOT '}converged, {result.solver})",
     ]

@@ -57,7 +57,7 @@ def experiment(
     particles: Annotated[
         int | None, typer.Option(help="Particles of all bodies together; goals stay as they are.  [default: the task's]")
     ] = None,
-    targets: Annotated[
+    goals: Annotated[
         Path | None, typer.Option(help="Directory with a goal <task>.npz for every task, instead of their own.", metavar="DIR")
     ] = None,
     backend: Annotated[

@@ -63,7 +63,7 @@ class ProgressBar(Progress):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._progress.stop()
 
-    def run_started(self, task: Task, target: Tensor, names: dict[str, str], seed: int) -> None:
+    def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
         """Learn the number of stages."""
         self._stages = self._stages or task.stage_count
 

@@ -29,7 +29,7 @@ FLAGS = {
     "seed": "--seed",
     "stages": "--stages",
     "steps": "--steps",
-    "target": "--target",
+    "goal": "--goal",
     "optimizer.iterations": "--iterations",
 }
 """Flag of each field of the configuration that has one, for messages."""
@@ -51,7 +51,7 @@ def run(
     seed: Annotated[int | None, typer.Option(help="Seed of first actions and random placements.  [default: 0]")] = None,
     stages: Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")] = None,
     steps: Annotated[int | None, typer.Option(help="Environment steps of a stage.  [default: the task's]")] = None,
-    target: Annotated[
+    goal: Annotated[
         Path | None, typer.Option(help="Goal file instead of the task's own, see `cpdeform task import-grid`.", metavar="FILE")
     ] = None,
     iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: by the task]")] = None,
@@ -80,7 +80,7 @@ def run(
     Exit code 0: a plan was found; 1: none was (the advice says what to try); 2: unusable input; 130, 143, 129: interrupted
     by control-C, SIGTERM, SIGHUP.
     """
-    flags = (task, backend, ot, placer, strategy, device, seed, stages, steps, target, iterations)
+    flags = (task, backend, ot, placer, strategy, device, seed, stages, steps, goal, iterations)
     given = {field: value for field, value in zip(FLAGS, flags, strict=True) if value is not None}
     resolved = resolve_command(given, settings or [], resume=resume, out=out)
     if dry_run:
@@ -142,7 +142,7 @@ def _execute(resolved: ResolvedRun, out: Path | None, *, overwrite: bool, silent
     from cpdeform.run.record import RunRecorder
 
     configuration = resolved.configuration
-    resolved.task.load_target()
+    resolved.task.load_goal()
     recorder = RunRecorder(
         out or _default_directory(resolved.task.name),
         configuration=configuration,

@@ -15,7 +15,7 @@ def generate_command(
     backend: Annotated[str, typer.Option(help="Simulator that it comes to rest in, in float64.", metavar="NAME")] = "auto",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
 ) -> None:
-    """Make a random goal for `cpdeform run SCENE --target FILE`: solids, ropes, cubes, letters and strokes, dents.
+    """Make a random goal for `cpdeform run SCENE --goal FILE`: solids, ropes, cubes, letters and strokes, dents.
 
     Goals are at rest, and within reach of the tools. The same seed gives the same file, bit for bit. Seeds below 1000 are for
     tuning a method, seeds from 1000 on for reporting results only.

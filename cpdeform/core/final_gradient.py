@@ -37,36 +37,36 @@ def check_final_gradient(trajectory: Trajectory, gradient: State | None) -> None
 
 
 def add_final_gradient(
-    trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None, position: Tensor | None, pose: Tensor | None
+    trajectory: Trajectory, grad_positions: Tensor, grad_tools: Tensor | None, position: Tensor | None, pose: Tensor | None
 ) -> tuple[Tensor, Tensor | None]:
     """Add gradients with respect to the final particles and tools to those with respect to the last step, which is the same place.
 
     Args:
         trajectory: Its last step is that of the final state.
         grad_positions: Gradient (B, T+1, N, 3); not modified.
-        grad_manipulators: Gradient (B, T+1, M, 8), or None for zero; not modified.
+        grad_tools: Gradient (B, T+1, M, 8), or None for zero; not modified.
         position: Gradient (B, N, 3) with respect to `final_state.position`, or None for zero.
-        pose: Gradient (B, M, 8) with respect to `final_state.manipulator_pose`, or None for zero.
+        pose: Gradient (B, M, 8) with respect to `final_state.tool_pose`, or None for zero.
 
     Returns:
-        The sums, in the shapes of `grad_positions` and `grad_manipulators`.
+        The sums, in the shapes of `grad_positions` and `grad_tools`.
     """
     if position is not None:
         grad_positions = grad_positions.clone()
         grad_positions[:, -1] += position.to(grad_positions)
     if pose is not None:
-        zero = grad_manipulators is None
-        grad_manipulators = torch.zeros_like(trajectory.manipulator_poses) if grad_manipulators is None else grad_manipulators
-        grad_manipulators = grad_manipulators if zero else grad_manipulators.clone()
-        grad_manipulators[:, -1] += pose.to(grad_manipulators)
-    return grad_positions, grad_manipulators
+        zero = grad_tools is None
+        grad_tools = torch.zeros_like(trajectory.tool_poses) if grad_tools is None else grad_tools
+        grad_tools = grad_tools if zero else grad_tools.clone()
+        grad_tools[:, -1] += pose.to(grad_tools)
+    return grad_positions, grad_tools
 
 
 def pull_back(
     simulator: Simulator,
     trajectory: Trajectory,
     grad_positions: Tensor | None,
-    grad_manipulators: Tensor | None,
+    grad_tools: Tensor | None,
     grad_final: Sequence[Tensor | None],
 ) -> RolloutGradient:
     """Call a backend's `vjp` with what autograd knows; None stands for zero.
@@ -78,7 +78,7 @@ def pull_back(
         simulator: Made the trajectory.
         trajectory: The rollout.
         grad_positions: Gradient (B, T+1, N, 3) with respect to the positions.
-        grad_manipulators: Gradient (B, T+1, M, 8) with respect to the tool poses.
+        grad_tools: Gradient (B, T+1, M, 8) with respect to the tool poses.
         grad_final: Gradients with respect to the final state's tensors, in the order of its fields.
 
     Raises:
@@ -88,7 +88,7 @@ def pull_back(
         grad_positions = torch.zeros_like(trajectory.positions)
     position, velocity, affine, strain, pose = grad_final
     if velocity is None and affine is None and strain is None:
-        return simulator.vjp(trajectory, *add_final_gradient(trajectory, grad_positions, grad_manipulators, position, pose))
+        return simulator.vjp(trajectory, *add_final_gradient(trajectory, grad_positions, grad_tools, position, pose))
     if not takes_final_gradient(simulator):
         raise CapabilityError(
             f"{type(simulator).__name__} has no gradient with respect to the final velocity, affine field and strain: its vjp "
@@ -97,7 +97,7 @@ def pull_back(
         )
     pairs = zip(grad_final, state_tensors(trajectory.final_state), strict=True)
     final = State(*(torch.zeros_like(like) if grad is None else grad for grad, like in pairs))
-    return simulator.vjp(trajectory, grad_positions, grad_manipulators, grad_final_state=final)
+    return simulator.vjp(trajectory, grad_positions, grad_tools, grad_final_state=final)
 
 
 def takes_final_gradient(simulator: Simulator) -> bool:

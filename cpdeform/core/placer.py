@@ -27,7 +27,7 @@ class Stage:
         index: Number of the stage, from 0.
         scene: The scene.
         state: The current state S_i, a single world.
-        target: Goal particles G (M, 3), length units.
+        goal: Goal particles G (M, 3), length units.
         transport: Solution of the placer's `Placer.transport_problem` from the N particles to the goal; None for a placer
             without one.
         generator: Source of randomness on the CPU, seeded by the run.
@@ -39,7 +39,7 @@ class Stage:
     index: int
     scene: Scene
     state: State
-    target: Tensor
+    goal: Tensor
     transport: OTResult | None
     generator: torch.Generator
     loss: float = float("nan")
@@ -75,8 +75,8 @@ class Proposal:
     """A candidate plan to begin with: poses of all tools, and how they begin to move. It becomes one world.
 
     Attributes:
-        pose: Tool poses (M, 8); see `State.manipulator_pose`.
-        score: The placement score (paper, section "Direct Single Manipulator Placement"), cost units; nan where not computed.
+        pose: Tool poses (M, 8); see `State.tool_pose`.
+        score: The placement score (paper, section "Direct Single Tool Placement"), cost units; nan where not computed.
         label: Short name of the candidate, e.g. ``"direct"`` or ``"left-right"``.
         contact_particle: Index of the particle the tools were placed around; None where there is none.
         actions: First actions (T, A) in [-1, 1] of the steps in which the tools act; None leaves them to the optimiser.
@@ -112,11 +112,11 @@ class PlacerCapabilities:
 
     Attributes:
         needs_priorities: Whether it reads `Stage.priorities`.
-        max_manipulators: The most movable tools it can place; None for any number.
+        max_tools: The most movable tools it can place; None for any number.
     """
 
     needs_priorities: bool
-    max_manipulators: int | None
+    max_tools: int | None
 
 
 class Placer(abc.ABC):

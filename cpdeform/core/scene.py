@@ -1,4 +1,4 @@
-"""What is simulated: bodies, material, manipulators and the discretisation, as validated frozen models.
+"""What is simulated: bodies, material, tools and the discretisation, as validated frozen models.
 
 Lengths are in units of the domain edge (the domain is the cube [0, 1]^3, y up), times in seconds, density is 1. The
 constants are those of PlasticineLab [1]_, odd ones included, so that results compare.
@@ -9,7 +9,7 @@ References:
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -24,15 +24,16 @@ from cpdeform.core.bounded import (
 from cpdeform.core.errors import InputError
 from cpdeform.core.material import Material
 from cpdeform.core.model import FrozenModel, NonNegativeFloat, PositiveFloat, Quaternion, Vector3
+from cpdeform.core.old_names import current_scene
 from cpdeform.core.shapes.body import BodyBase
-from cpdeform.core.shapes.box import BodyBox, ManipulatorBox
-from cpdeform.core.shapes.chopsticks import ManipulatorChopsticks
-from cpdeform.core.shapes.cylinder import ManipulatorCylinder
-from cpdeform.core.shapes.kinds import Body, Manipulator
-from cpdeform.core.shapes.manipulator import ManipulatorBase
-from cpdeform.core.shapes.rod import ManipulatorCapsule, ManipulatorRod, ManipulatorRollingPin
-from cpdeform.core.shapes.sphere import BodySphere, ManipulatorSphere
-from cpdeform.core.shapes.torus import ManipulatorTorus
+from cpdeform.core.shapes.box import BodyBox, ToolBox
+from cpdeform.core.shapes.chopsticks import ToolChopsticks
+from cpdeform.core.shapes.cylinder import ToolCylinder
+from cpdeform.core.shapes.kinds import Body, Tool
+from cpdeform.core.shapes.rod import ToolCapsule, ToolRod, ToolRollingPin
+from cpdeform.core.shapes.sphere import BodySphere, ToolSphere
+from cpdeform.core.shapes.tool import ToolBase
+from cpdeform.core.shapes.torus import ToolTorus
 
 __all__ = [
     "WALL_NODES",
@@ -41,21 +42,21 @@ __all__ = [
     "BodyBox",
     "BodySphere",
     "FrozenModel",
-    "Manipulator",
-    "ManipulatorBase",
-    "ManipulatorBox",
-    "ManipulatorCapsule",
-    "ManipulatorChopsticks",
-    "ManipulatorCylinder",
-    "ManipulatorRod",
-    "ManipulatorRollingPin",
-    "ManipulatorSphere",
-    "ManipulatorTorus",
     "Material",
     "NonNegativeFloat",
     "PositiveFloat",
     "Quaternion",
     "Scene",
+    "Tool",
+    "ToolBase",
+    "ToolBox",
+    "ToolCapsule",
+    "ToolChopsticks",
+    "ToolCylinder",
+    "ToolRod",
+    "ToolRollingPin",
+    "ToolSphere",
+    "ToolTorus",
     "Vector3",
 ]
 
@@ -68,7 +69,7 @@ class Scene(FrozenModel):
 
     Attributes:
         bodies: The clay, one entry a body, in the order of the particles.
-        manipulators: The tools, in the order of the actions and of the pose tensor's second axis.
+        tools: The tools, in the order of the actions and of the pose tensor's second axis.
         material: Material of bodies that name none.
         gravity_parameter: Gravity as the scene tables give it, dimensionless; the acceleration is `gravity_scale` times it.
         gravity_scale: Acceleration per unit of gravity parameter, length/second^2 (PlasticineLab's quirk: 30).
@@ -85,7 +86,7 @@ class Scene(FrozenModel):
     """
 
     bodies: tuple[Body, ...] = Field(min_length=1, max_length=MOST_PARTS)
-    manipulators: tuple[Manipulator, ...] = Field(default=(), max_length=MOST_PARTS)
+    tools: tuple[Tool, ...] = Field(default=(), max_length=MOST_PARTS)
     material: Material = Material()
     gravity_parameter: Vector3 = (0.0, -1.0, 0.0)
     gravity_scale: Real = Field(default=30.0, ge=0.0, le=1e6)
@@ -97,6 +98,11 @@ class Scene(FrozenModel):
     softness: Real = Field(default=666.0, ge=0.0, le=1e9)
     sampling: Literal["uniform", "plasticinelab"] = "uniform"
     sampling_seed: Seed = Field(default=0, le=2**32 - 1)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_old_names(cls, content: Any) -> Any:
+        return current_scene(content)
 
     @model_validator(mode="after")
     def _check_particle_count(self) -> Scene:
@@ -150,8 +156,8 @@ class Scene(FrozenModel):
 
     @property
     def action_size(self) -> int:
-        """Number of action components of all manipulators together."""
-        return sum(manipulator.action_size for manipulator in self.manipulators)
+        """Number of action components of all tools together."""
+        return sum(tool.action_size for tool in self.tools)
 
     def material_of(self, body: int) -> Material:
         """Material of the body with the given index."""

@@ -33,14 +33,14 @@ class SimulatorCapabilities:
         differentiable: Whether `Simulator.vjp` is implemented.
         devices: Device types that work, of ``"cpu"`` and ``"cuda"``.
         dtypes: Floating-point types that work; the first is the default.
-        manipulator_kinds: Values of `Manipulator.kind` that work.
+        tool_kinds: Values of `Tool.kind` that work.
         deterministic_devices: Device types on which a repeated rollout is equal bit for bit.
     """
 
     differentiable: bool
     devices: tuple[str, ...]
     dtypes: tuple[torch.dtype, ...]
-    manipulator_kinds: tuple[str, ...]
+    tool_kinds: tuple[str, ...]
     deterministic_devices: tuple[str, ...]
 
 
@@ -50,7 +50,7 @@ class Trajectory:
 
     Attributes:
         positions: Particle positions (B, T+1, N, 3) at the start and after each step, length units.
-        manipulator_poses: Tool poses (B, T+1, M, 8) at the same times; see `State.manipulator_pose`.
+        tool_poses: Tool poses (B, T+1, M, 8) at the same times; see `State.tool_pose`.
         actions: The actions (B, T, A) that were executed, in [-1, 1].
         initial_state: State of B worlds before the first step; a copy of what was given.
         final_state: State of B worlds after the last step.
@@ -59,7 +59,7 @@ class Trajectory:
     """
 
     positions: Tensor
-    manipulator_poses: Tensor
+    tool_poses: Tensor
     actions: Tensor
     initial_state: State
     final_state: State
@@ -95,7 +95,7 @@ class Simulator(abc.ABC):
         dtype: Floating-point type; defaults to the backend's first declared one.
 
     Raises:
-        CapabilityError: The backend does not support the device, the type or a manipulator of the scene.
+        CapabilityError: The backend does not support the device, the type or a tool of the scene.
         InputError: `batch_size` is below 1 or no number, `device` is no device, or CUDA is asked for where there is none.
     """
 
@@ -120,11 +120,11 @@ class Simulator(abc.ABC):
             raise InputError("device", came=str(self.device), expected="a CUDA device", remedy='None was found; use device "cpu".')
         if self.dtype not in can.dtypes:
             raise CapabilityError(f"{name} computes in {', '.join(map(str, can.dtypes))}, not in {self.dtype}.")
-        for index, manipulator in enumerate(self.scene.manipulators):
-            if manipulator.kind not in can.manipulator_kinds:
+        for index, tool in enumerate(self.scene.tools):
+            if tool.kind not in can.tool_kinds:
                 raise CapabilityError(
-                    f"{name} has no manipulator of kind {manipulator.kind} (manipulators.{index}); "
-                    f"it has {', '.join(can.manipulator_kinds)}. Choose another backend or tool."
+                    f"{name} has no tool of kind {tool.kind} (tools.{index}); "
+                    f"it has {', '.join(can.tool_kinds)}. Choose another backend or tool."
                 )
 
     def initial_state(self, *, batch_size: int | None = None) -> State:
@@ -150,9 +150,9 @@ class Simulator(abc.ABC):
             )
         if state.particle_count != self.scene.particle_count:
             raise InputError("state", came=f"{state.particle_count} particles", expected=f"{self.scene.particle_count} particles")
-        if state.manipulator_pose.shape[1] != len(self.scene.manipulators):
-            count = state.manipulator_pose.shape[1]
-            raise InputError("state", came=f"{count} manipulators", expected=f"{len(self.scene.manipulators)} manipulators")
+        if state.tool_pose.shape[1] != len(self.scene.tools):
+            count = state.tool_pose.shape[1]
+            raise InputError("state", came=f"{count} tools", expected=f"{len(self.scene.tools)} tools")
         check_values(self.scene, state, actions)
 
     @abc.abstractmethod
@@ -161,7 +161,7 @@ class Simulator(abc.ABC):
 
         Args:
             state: Start of B worlds; not modified, and free to be changed afterwards.
-            actions: Actions (B, T, A) in [-1, 1], the manipulators' components one after the other.
+            actions: Actions (B, T, A) in [-1, 1], the tools' components one after the other.
 
         Returns:
             The trajectory, with the checkpoints that `vjp` needs.
@@ -176,7 +176,7 @@ class Simulator(abc.ABC):
         self,
         trajectory: Trajectory,
         grad_positions: Tensor,
-        grad_manipulators: Tensor | None = None,
+        grad_tools: Tensor | None = None,
         *,
         grad_final_state: State | None = None,
     ) -> RolloutGradient:
@@ -185,7 +185,7 @@ class Simulator(abc.ABC):
         Args:
             trajectory: Made by this simulator's `rollout`.
             grad_positions: Gradient (B, T+1, N, 3) of a scalar with respect to `trajectory.positions`.
-            grad_manipulators: Gradient (B, T+1, M, 8) with respect to `trajectory.manipulator_poses`; defaults to zero.
+            grad_tools: Gradient (B, T+1, M, 8) with respect to `trajectory.tool_poses`; defaults to zero.
             grad_final_state: Gradient with respect to every tensor of `trajectory.final_state`, in its shapes; defaults to zero.
                 Those of positions and tools add to what the other two say about the last step. The entries for the off-diagonal
                 `elastic_strain` numbers are as in `RolloutGradient.initial_state`, which is what the rollout after this one gives.
@@ -237,7 +237,7 @@ class _RolloutFunction(torch.autograd.Function):
         # what is returned will refer to `ctx`: were `ctx` to refer back, neither would ever be collected, so it gets other tensors
         ctx.simulator, ctx.trajectory = simulator, _detached(trajectory)
         ctx.set_materialize_grads(False)
-        return trajectory.positions, trajectory.manipulator_poses, *state_tensors(trajectory.final_state)
+        return trajectory.positions, trajectory.tool_poses, *state_tensors(trajectory.final_state)
 
     @staticmethod
     @once_differentiable
@@ -252,7 +252,7 @@ def _detached(trajectory: Trajectory) -> Trajectory:
     return dataclasses.replace(
         trajectory,
         positions=trajectory.positions.detach(),
-        manipulator_poses=trajectory.manipulator_poses.detach(),
+        tool_poses=trajectory.tool_poses.detach(),
         actions=trajectory.actions.detach(),
         initial_state=trajectory.initial_state.map(Tensor.detach),
         final_state=trajectory.final_state.map(Tensor.detach),
@@ -274,7 +274,7 @@ def differentiable_rollout(simulator: Simulator, state: State, actions: Tensor) 
         actions: Actions (B, T, A) in [-1, 1].
 
     Returns:
-        A trajectory whose `positions` (B, T+1, N, 3), `manipulator_poses` (B, T+1, M, 8) and `final_state`, with all its tensors,
+        A trajectory whose `positions` (B, T+1, N, 3), `tool_poses` (B, T+1, M, 8) and `final_state`, with all its tensors,
         are part of the autograd graph. It can be differentiated once.
 
     Raises:
@@ -285,4 +285,4 @@ def differentiable_rollout(simulator: Simulator, state: State, actions: Tensor) 
         raise CapabilityError(f"{type(simulator).__name__} is not differentiable; choose a backend that is.")
     made: list[Trajectory] = []
     positions, poses, *final = _RolloutFunction.apply(simulator, made, actions, *state_tensors(state))  # type: ignore[no-untyped-call]
-    return dataclasses.replace(made[0], positions=positions, manipulator_poses=poses, final_state=State(*final))
+    return dataclasses.replace(made[0], positions=positions, tool_poses=poses, final_state=State(*final))

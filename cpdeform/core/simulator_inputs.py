@@ -93,7 +93,7 @@ def _all_bounds(scene: Scene, state: State, actions: Tensor) -> Iterator[_Bounds
     for name in ("velocity", "affine", "elastic_strain"):
         values = getattr(state, name)
         yield _Bounds(f"state.{name}", values, -math.inf, math.inf, particle, "finite numbers", _DIVERGED)
-    pose, name = state.manipulator_pose, "state.manipulator_pose"
+    pose, name = state.tool_pose, "state.tool_pose"
     near = f"positions of tools from {-TOOL_REACH:g} to {1.0 + TOOL_REACH:g} length units"
     yield _Bounds(name, pose[..., :3], -TOOL_REACH, 1.0 + TOOL_REACH, tool, near, whole)
     lengths = torch.linalg.vector_norm(pose[..., 3:7], dim=-1)

@@ -18,7 +18,7 @@ STRAIN_COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """Particles and manipulators of B worlds.
+    """Particles and tools of B worlds.
 
     Attributes:
         position: Particle positions (B, N, 3), length units.
@@ -26,24 +26,24 @@ class State:
         affine: Affine velocity field C of APIC (B, N, 3, 3), 1/second.
         elastic_strain: Elastic left Cauchy-Green deformation minus identity, b - I with b = F F^T, as its six entries
             xx, yy, zz, xy, xz, yz (B, N, 6), dimensionless. The material model is isotropic, so F enters through b only.
-        manipulator_pose: Position (length units), unit quaternion wxyz, gap (length units) of each tool (B, M, 8).
+        tool_pose: Position (length units), unit quaternion wxyz, gap (length units) of each tool (B, M, 8).
     """
 
     position: Tensor
     velocity: Tensor
     affine: Tensor
     elastic_strain: Tensor
-    manipulator_pose: Tensor
+    tool_pose: Tensor
 
     def __post_init__(self) -> None:
         worlds, particles = self.position.shape[:2] if self.position.ndim == 3 else (0, 0)
-        tools = self.manipulator_pose.shape[1] if self.manipulator_pose.ndim == 3 else 0
+        tools = self.tool_pose.shape[1] if self.tool_pose.ndim == 3 else 0
         expected = {
             "position": (worlds, particles, 3),
             "velocity": (worlds, particles, 3),
             "affine": (worlds, particles, 3, 3),
             "elastic_strain": (worlds, particles, 6),
-            "manipulator_pose": (worlds, tools, 8),
+            "tool_pose": (worlds, tools, 8),
         }
         for name, shape in expected.items():
             came = tuple(getattr(self, name).shape)
@@ -85,18 +85,18 @@ class State:
         """Return one world as a batch of one."""
         return self.map(lambda tensor: tensor[world : world + 1])
 
-    def with_manipulators(self, pose: Tensor) -> State:
+    def with_tools(self, pose: Tensor) -> State:
         """Return this state with other tool poses (B, M, 8)."""
-        return dataclasses.replace(self, manipulator_pose=pose.to(self.position))
+        return dataclasses.replace(self, tool_pose=pose.to(self.position))
 
 
-def manipulator_pose(scene: Scene) -> Tensor:
+def tool_pose(scene: Scene) -> Tensor:
     """Start poses (M, 8) of the scene's tools, float64: position, unit quaternion wxyz, gap."""
     rows = []
-    for manipulator in scene.manipulators:
-        norm = sum(component**2 for component in manipulator.rotation_wxyz) ** 0.5
-        rotation = [component / norm for component in manipulator.rotation_wxyz]
-        rows.append([*manipulator.position, *rotation, manipulator.start_gap])
+    for tool in scene.tools:
+        norm = sum(component**2 for component in tool.rotation_wxyz) ** 0.5
+        rotation = [component / norm for component in tool.rotation_wxyz]
+        rows.append([*tool.position, *rotation, tool.start_gap])
     return torch.tensor(rows, dtype=torch.float64).reshape(len(rows), 8)
 
 
@@ -121,7 +121,7 @@ def initial_state(
         velocity=torch.zeros(1, count, 3, dtype=torch.float64),
         affine=torch.zeros(1, count, 3, 3, dtype=torch.float64),
         elastic_strain=torch.zeros(1, count, 6, dtype=torch.float64),
-        manipulator_pose=manipulator_pose(scene).unsqueeze(0),
+        tool_pose=tool_pose(scene).unsqueeze(0),
     )
     return state.to(device=device, dtype=dtype).fork(batch_size)
 

@@ -1,4 +1,4 @@
-"""Tasks: a scene, a target shape and a schedule, read from YAML files."""
+"""Tasks: a scene, a goal and a schedule, read from YAML files."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from cpdeform.core.bounded import MOST_STAGES, MOST_STEPS, Name, Whole
 from cpdeform.core.errors import InputError, PluginError, UnknownNameError
+from cpdeform.core.goal import load_correspondence, load_goal, load_goal_grid
+from cpdeform.core.old_names import current_scene, current_task
 from cpdeform.core.plugins import Registry, describe, load_registry, redirect_prints
 from cpdeform.core.reading.models import validate
 from cpdeform.core.reading.yaml_text import read_yaml
 from cpdeform.core.scene import FrozenModel, Scene
-from cpdeform.core.target import load_correspondence, load_target, load_target_grid
 
 __all__ = [
     "Task",
     "changed_task",
     "limited_task",
     "list_variants",
-    "load_target",
+    "load_goal",
     "load_task",
     "merge",
     "read_task",
@@ -40,7 +41,7 @@ class Task(FrozenModel):
         name: Name with variant, e.g. ``"writer-v2"``.
         summary: One line for listings.
         scene: What is simulated.
-        target: File of the target particles, see `load_target`.
+        goal: File of the goal particles, see `load_goal`.
         step_count: Environment steps T of one stage in which the tools act.
         rest_steps: Environment steps that follow, in which the tools hold still. The shape is judged when they are over: clay that
             was pushed slides on, and a shape that is right only in passing is no result.
@@ -53,19 +54,24 @@ class Task(FrozenModel):
     name: Name
     summary: str = Field(default="", max_length=10_000)
     scene: Scene
-    target: Path
+    goal: Path
     step_count: Whole = Field(default=10, ge=1, le=MOST_STEPS)
     rest_steps: Whole = Field(default=0, ge=0, le=MOST_STEPS)
     stage_count: Whole = Field(default=1, ge=1, le=MOST_STAGES)
     metric: Literal["incremental_iou", "wasserstein"] = "wasserstein"
     limits: dict[str, Any] = Field(default_factory=dict)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _take_old_names(cls, content: Any) -> Any:
+        return current_task(content)
+
     @property
     def rollout_steps(self) -> int:
         """Environment steps of one stage, action and rest together."""
         return self.step_count + self.rest_steps
 
-    def load_target(self) -> NDArray[np.float64]:
+    def load_goal(self) -> NDArray[np.float64]:
         """Read the goal particles.
 
         Returns:
@@ -74,9 +80,9 @@ class Task(FrozenModel):
         Raises:
             InputError: The file is missing or unreadable, or holds something else than finite positions in the domain.
         """
-        return load_target(self.target, scene=self.scene)
+        return load_goal(self.goal, scene=self.scene)
 
-    def load_target_grid(self) -> NDArray[np.float64] | None:
+    def load_goal_grid(self) -> NDArray[np.float64] | None:
         """Read the goal's own node masses, if its file holds them, as one imported from a grid does.
 
         Returns:
@@ -85,15 +91,15 @@ class Task(FrozenModel):
         Raises:
             InputError: The file is missing or unreadable, or the masses do not fit the scene's grid.
         """
-        return load_target_grid(self.target, scene=self.scene)
+        return load_goal_grid(self.goal, scene=self.scene)
 
-    def target_corresponds(self) -> bool:
+    def goal_corresponds(self) -> bool:
         """Whether the goal's file says that its particles are the body's, one to one, moved, and their number does not deny it.
 
         Raises:
             InputError: The file is missing or unreadable.
         """
-        return load_correspondence(self.target) and len(self.load_target()) == self.scene.particle_count
+        return load_correspondence(self.goal) and len(self.load_goal()) == self.scene.particle_count
 
 
 def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -127,13 +133,17 @@ def _read_mapping(path: Path) -> dict[str, Any]:
     content = read_yaml(path, argument=argument)
     if not isinstance(content, dict):
         raise InputError(argument, came=type(content).__name__, expected="a mapping with the fields of a task")
-    return content
+    try:
+        renamed: dict[str, Any] = current_task(content)
+    except InputError as error:
+        raise InputError(f"{argument}: {error.argument}", came=error.came, expected=error.expected, remedy=error.remedy) from error
+    return renamed
 
 
 def read_task(path: Path, *, variant: str | None = None) -> Task:
     """Read a task file.
 
-    The file holds the fields of `Task`; a relative `target` is relative to the file. Under `variants`, names map to changes of
+    The file holds the fields of `Task`; a relative `goal` is relative to the file. Under `variants`, names map to changes of
     these fields; without a variant's name the first one applies.
 
     Args:
@@ -168,8 +178,8 @@ def read_task(path: Path, *, variant: str | None = None) -> Task:
         content = merge(content, variants[variant])
         content["name"] = f"{base}-{variant}"
     content.setdefault("name", base)
-    if isinstance(content.get("target"), str):
-        content["target"] = path.parent / content["target"]
+    if isinstance(content.get("goal"), str):
+        content["goal"] = path.parent / content["goal"]
     return validate(Task, content, source=f"task file {path}")
 
 
@@ -189,7 +199,7 @@ def changed_task(
     task: Task,
     *,
     scene: Mapping[str, Any] | None = None,
-    target: Path | None = None,
+    goal: Path | None = None,
     step_count: int | None = None,
     rest_steps: int | None = None,
 ) -> Task:
@@ -198,14 +208,14 @@ def changed_task(
     Args:
         task: The task.
         scene: Changes of its scene, nested as `merge` takes them.
-        target: Another file of its goal.
+        goal: Another file of its goal.
         step_count: Another number of environment steps of a stage.
         rest_steps: Another number of steps of rest after them.
 
     Raises:
         InputError: A change does not fit.
     """
-    changes = {"scene": scene or None, "target": target, "step_count": step_count, "rest_steps": rest_steps}
+    changes = {"scene": current_scene(scene) or None, "goal": goal, "step_count": step_count, "rest_steps": rest_steps}
     changes = {field: change for field, change in changes.items() if change is not None}
     if not changes:
         return task

@@ -133,7 +133,7 @@ def is_done(directory: Path, configuration: RunConfiguration, task: Task) -> boo
 
 
 def _same_configuration(record: RunRecord, configuration: RunConfiguration) -> bool:
-    apart = {"task", "target", "stages"}
+    apart = {"task", "goal", "stages"}
     recorded = recorded_configuration(record).model_dump(mode="json", exclude=apart)
     return recorded == configuration.model_dump(mode="json", exclude=apart)
 
@@ -144,8 +144,8 @@ def _same_task(record: RunRecord, configuration: RunConfiguration, task: Task) -
         return False
     if any(getattr(record.task, name) != getattr(task, name) for name in ("name", "scene", "step_count", "rest_steps", "metric")):
         return False
-    goal = torch.as_tensor(task.load_target()).to(record.target)
-    return goal.shape == record.target.shape and torch.allclose(goal, record.target, rtol=0.0, atol=SAME_GOAL)
+    goal = torch.as_tensor(task.load_goal()).to(record.goal)
+    return goal.shape == record.goal.shape and torch.allclose(goal, record.goal, rtol=0.0, atol=SAME_GOAL)
 
 
 def recorded_runs(

@@ -44,7 +44,7 @@ REFERENCE, BASELINE = "cpdeform", "fixed"
 """With equal evaluations the second gets as many as the first one used."""
 
 OWN_OPTIONS: Mapping[str, str] = MappingProxyType(
-    {"task": "--tasks", "seed": "--seeds", "placer": "--methods", "strategy": "--methods", "target": "--targets"}
+    {"task": "--tasks", "seed": "--seeds", "placer": "--methods", "strategy": "--methods", "goal": "--goals"}
 )
 """Fields of the configuration that the experiment sets itself, and the option to use instead."""
 
@@ -62,7 +62,7 @@ class ExperimentSettings:
         iterations: The most gradient steps per stage; defaults to what the strategy sets.
         stages: Number of stages; defaults to the task's own.
         particles: Number of particles of all bodies together, shared out as the task does; defaults to the task's own.
-        targets: Directory with a goal ``<task name>.npz`` for every task, instead of the tasks' own.
+        goals: Directory with a goal ``<task name>.npz`` for every task, instead of the tasks' own.
         backend: Registered name of the simulator; defaults to that of `RunConfiguration`.
         ot: Registered name of the transport solver; defaults to that of `RunConfiguration`.
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``; defaults to that of `RunConfiguration`.
@@ -84,7 +84,7 @@ class ExperimentSettings:
     iterations: int | None = None
     stages: int | None = None
     particles: int | None = None
-    targets: Path | None = None
+    goals: Path | None = None
     backend: str | None = None
     ot: str | None = None
     device: str | None = None
@@ -112,8 +112,8 @@ class ExperimentSettings:
                 raise InputError("--set", came=f'"{field}"', expected="another field", remedy=f"Use {option} instead.")
         if self.equal_evaluations and not {REFERENCE, BASELINE} <= set(self.methods):
             raise InputError("--equal-evaluations", came=", ".join(self.methods), expected=f"methods {REFERENCE} and {BASELINE}")
-        if self.targets is not None and not self.targets.is_dir():
-            raise InputError("--targets", came=str(self.targets), expected="a directory")
+        if self.goals is not None and not self.goals.is_dir():
+            raise InputError("--goals", came=str(self.goals), expected="a directory")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -199,8 +199,8 @@ def configure(run: PlannedRun, settings: ExperimentSettings, *, registry: Regist
         values = merge(values, {"optimizer": {"iterations": iterations, "patience": iterations}})
     if settings.particles is not None:
         values["scene"] = _with_particles(load_task(run.source, registry=registry), values.get("scene", {}), settings.particles)
-    if settings.targets is not None:
-        values["target"] = _goal(settings.targets, run.task)
+    if settings.goals is not None:
+        values["goal"] = _goal(settings.goals, run.task)
     return resolve(validate(RunConfiguration, values, source="experiment"), registry=registry)
 
 
@@ -226,9 +226,9 @@ def _with_particles(task: Task, scene: Mapping[str, Any], total: int) -> dict[st
     return merge(scene, {"bodies": {str(index): {"particle_count": count} for index, count in enumerate(shared)}})
 
 
-def _goal(targets: Path, task: str) -> Path:
-    path = targets / f"{task}.npz"
+def _goal(goals: Path, task: str) -> Path:
+    path = goals / f"{task}.npz"
     if not path.is_file():
-        remedy = "Make it with `cpdeform task import-grid`, or leave --targets out."
-        raise InputError(f"--targets: goal of {task}", came=f"no file {path.name}", expected="one for every task", remedy=remedy)
+        remedy = "Make it with `cpdeform task import-grid`, or leave --goals out."
+        raise InputError(f"--goals: goal of {task}", came=f"no file {path.name}", expected="one for every task", remedy=remedy)
     return path

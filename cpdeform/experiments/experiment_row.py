@@ -263,7 +263,7 @@ def judge(record: RunRecord, *, paper_metric: bool, shape: bool = False) -> dict
         raise InputError(f"run record {record.directory}", came="a run that went on from another", expected="one from the start")
     found = evaluate_record(record, paper=paper_metric)
     figures = {
-        "goal_particles": found.target_count,
+        "goal_particles": found.goal_count,
         "w1_initial": found.wasserstein_start,
         "w1_final": found.wasserstein_final,
         "w1_floor": found.sampling_floor,

@@ -255,7 +255,7 @@ def _settings(row: ExperimentRow) -> dict[str, str]:
         for key, value in _flatten(row.configuration)
         if key not in OWN_OPTIONS and (key not in defaults or defaults[key] != value)
     }
-    settings["goal"] = "the task's own" if row.configuration.get("target") is None else "a given file"
+    settings["goal"] = "the task's own" if row.configuration.get("goal") is None else "a given file"
     return settings
 
 

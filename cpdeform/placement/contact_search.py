@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from cpdeform.core.scene import Manipulator
+from cpdeform.core.scene import Tool
 from cpdeform.placement.grasp import Cost
 from cpdeform.placement.grid import GridOptions, ToolGrid
 from cpdeform.placement.priorities import Exploration
@@ -40,12 +40,12 @@ class ContactSearch:
     @property
     def poses(self) -> Tensor:
         """A copy of the tools' poses (M, 8) at the stage's start."""
-        return self.exploration.stage.state.manipulator_pose[0].detach().clone()
+        return self.exploration.stage.state.tool_pose[0].detach().clone()
 
     @property
     def fixed(self) -> list[int]:
         """Indices of the tools that do not move."""
-        return [index for index in range(len(self.exploration.stage.scene.manipulators)) if index not in self.movable]
+        return [index for index in range(len(self.exploration.stage.scene.tools)) if index not in self.movable]
 
     def cost(self) -> Cost:
         """What the score loses, for tools at given positions."""
@@ -53,9 +53,9 @@ class ContactSearch:
         weighted = priorities != 0.0
         points, weights = self.particles[weighted], priorities[weighted] / priorities.shape[0]
 
-        def cost(manipulator: Manipulator, quaternion: Tensor, positions: Tensor) -> Tensor:
+        def cost(tool: Tool, quaternion: Tensor, positions: Tensor) -> Tensor:
             return reduce_distances(
-                manipulator, quaternion, positions, points, lambda distance: score_loss(distance, weights, self.distance_scale)
+                tool, quaternion, positions, points, lambda distance: score_loss(distance, weights, self.distance_scale)
             )
 
         return cost
@@ -68,15 +68,13 @@ class ContactSearch:
         """Poses (M, 8) with the grid's tool at its best position around a particle, and the cost there; None for no room."""
         cost, weights = self.cost(), self.exploration.priorities / self.exploration.priorities.shape[0]
         noise = 4.0 * torch.finfo(weights.dtype).eps * float(weights.abs().sum()) * float(grid.half_extents.max()) ** 2
-        found = grid.search(
-            grid.particles[contact], lambda positions: cost(grid.manipulator, grid.quaternion, positions), tolerance=noise
-        )
+        found = grid.search(grid.particles[contact], lambda positions: cost(grid.tool, grid.quaternion, positions), tolerance=noise)
         return None if found is None else (grid.pose_at(found.position), found.cost)
 
     def contacts(self, contact: int) -> Iterator[int]:
         """The contact point, then that of the next body in the ranking and so on; on each body away from those before."""
         exploration, ranking = self.exploration, self.exploration.ranking
-        widest = max(half_width(tool, widest=True) for tool in exploration.stage.scene.manipulators if tool.movable)
+        widest = max(half_width(tool, widest=True) for tool in exploration.stage.scene.tools if tool.movable)
         taken = exploration.near(contact, 2.0 * widest)
         yield contact
         number, empty = ranking.index(int(exploration.bodies[contact])), 0
@@ -89,9 +87,9 @@ class ContactSearch:
                 yield following
 
 
-def half_width(manipulator: Manipulator, *, widest: bool = False) -> float:
+def half_width(tool: Tool, *, widest: bool = False) -> float:
     """Half of a tool's smallest or largest width, length units."""
-    half = tool_half_extents(manipulator, torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    half = tool_half_extents(tool, torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64))
     return float(half.max() if widest else half.min())
 
 

@@ -8,8 +8,8 @@ from cpdeform.core.placer import Placer, PlacerCapabilities, Proposal, Stage
 class PlacerFixed(Placer):
     """Tools stay where the current state has them, also where they touch or overlap the body."""
 
-    capabilities = PlacerCapabilities(needs_priorities=False, max_manipulators=None)
+    capabilities = PlacerCapabilities(needs_priorities=False, max_tools=None)
 
     def ask(self, stage: Stage) -> list[Proposal]:
         """Propose the current poses as the only candidate."""
-        return [Proposal(pose=stage.state.manipulator_pose[0].clone(), score=float("nan"), label="fixed")]
+        return [Proposal(pose=stage.state.tool_pose[0].clone(), score=float("nan"), label="fixed")]

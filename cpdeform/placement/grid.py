@@ -11,7 +11,7 @@ from torch import Tensor
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.placer import Stage
 from cpdeform.core.rotation import rotate
-from cpdeform.core.scene import Manipulator
+from cpdeform.core.scene import Tool
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.placement.tool import placed_surface, surface_points, tool_half_extents
 from cpdeform.placement.touch import CHUNK_DISTANCES, reduce_distances, smallest_gaps
@@ -63,13 +63,13 @@ class GridResult:
     cost: float
 
 
-def movable_manipulators(stage: Stage) -> list[int]:
+def movable_tools(stage: Stage) -> list[int]:
     """Indices of the scene's movable tools.
 
     Raises:
         CapabilityError: The scene has none.
     """
-    movable = [index for index, manipulator in enumerate(stage.scene.manipulators) if manipulator.movable]
+    movable = [index for index, tool in enumerate(stage.scene.tools) if tool.movable]
     if not movable:
         raise CapabilityError("The scene has no movable tool to be placed; give one a positive action_scale.")
     return movable
@@ -101,16 +101,16 @@ class ToolGrid:
         if stage.state.batch_size != 1:
             raise InputError("stage.state", came=f"{stage.state.batch_size} worlds", expected="a single world")
         self.options = options
-        self.manipulator: Manipulator = stage.scene.manipulators[index]
+        self.tool: Tool = stage.scene.tools[index]
         self.particles = stage.state.position[0].detach()
-        poses = stage.state.manipulator_pose[0].detach() if poses is None else poses
+        poses = stage.state.tool_pose[0].detach() if poses is None else poses
         self.index, self.poses, self.quaternion = index, poses, poses[index, 3:7]
-        self.half_extents = tool_half_extents(self.manipulator, self.quaternion)
-        self._lower = poses.new_tensor(self.manipulator.lower_bound)
-        self._upper = poses.new_tensor(self.manipulator.upper_bound)
-        self._surface = surface_points(self.manipulator).to(poses)
-        others = [other for other in range(len(stage.scene.manipulators)) if other != index] if obstacles is None else obstacles
-        self._fixed = [(stage.scene.manipulators[other], poses[other]) for other in others]
+        self.half_extents = tool_half_extents(self.tool, self.quaternion)
+        self._lower = poses.new_tensor(self.tool.lower_bound)
+        self._upper = poses.new_tensor(self.tool.upper_bound)
+        self._surface = surface_points(self.tool).to(poses)
+        others = [other for other in range(len(stage.scene.tools)) if other != index] if obstacles is None else obstacles
+        self._fixed = [(stage.scene.tools[other], poses[other]) for other in others]
         clouds = [placed_surface(tool, pose) for tool, pose in self._fixed]
         self._obstacles = torch.cat(clouds) if clouds else self.particles[:0]
 
@@ -131,7 +131,7 @@ class ToolGrid:
         Returns:
             Numbers (G,).
         """
-        return reduce_distances(self.manipulator, self.quaternion, positions, points, reduction)
+        return reduce_distances(self.tool, self.quaternion, positions, points, reduction)
 
     def smallest_gap(self, position: Tensor) -> float:
         """Distance between the tool's surface at `position` (3,) and the nearest particle, length units."""
@@ -157,7 +157,7 @@ class ToolGrid:
             positions = positions[self._gaps_to_tool(positions, tool, pose) >= self.options.clearance]
         return positions
 
-    def _gaps_to_tool(self, positions: Tensor, other: Manipulator, pose: Tensor) -> Tensor:
+    def _gaps_to_tool(self, positions: Tensor, other: Tool, pose: Tensor) -> Tensor:
         """Least distance (G,) of this tool's surface to another tool, negative where it reaches inside."""
         surface = rotate(self.quaternion, self._surface)
         step = max(1, CHUNK_DISTANCES // surface.shape[0])
@@ -167,7 +167,7 @@ class ToolGrid:
     def _gaps(self, positions: Tensor, points: Tensor, reach: float = 0.0) -> Tensor:
         """Distance (G,) between the tool and the nearest of the points (P, 3); exact up to `reach` or the clearance."""
         reach = max(reach, self.options.clearance)
-        return smallest_gaps(self.manipulator, self.quaternion, positions, points, reach=reach)
+        return smallest_gaps(self.tool, self.quaternion, positions, points, reach=reach)
 
     def search(self, contact: Tensor, cost: Callable[[Tensor], Tensor], *, tolerance: float = 0.0) -> GridResult | None:
         """Find the feasible position of lowest cost around a contact point.

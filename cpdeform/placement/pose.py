@@ -2,7 +2,7 @@
 
 References:
     Li et al., "Contact Points Discovery for Soft-Body Manipulations with Differentiable Physics", ICLR 2022, section "Multiple
-    Manipulator Placement With Heuristic".
+    Tool Placement With Heuristic".
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.rotation import multiply, rotate
-from cpdeform.core.scene import Manipulator, Vector3
+from cpdeform.core.scene import Tool, Vector3
 
 GRASP_DIRECTIONS: Mapping[str, Vector3] = MappingProxyType(
     {"left-right": (1.0, 0.0, 0.0), "top-bottom": (0.0, 1.0, 0.0), "front-back": (0.0, 0.0, 1.0)}
@@ -22,24 +22,24 @@ GRASP_DIRECTIONS: Mapping[str, Vector3] = MappingProxyType(
 """Axis along which the tools of a grasp face each other."""
 
 
-def turned(manipulator: Manipulator, direction: Tensor) -> Tensor:
+def turned(tool: Tool, direction: Tensor) -> Tensor:
     """Rotation in which a tool presses along a direction: a flat one its broadest face; round ones keep their start rotation.
 
     A plate pressed edge-on into the clay would cut it. A round tool's start rotation says how the scene means it to be held.
 
     Args:
-        manipulator: The tool.
+        tool: The tool.
         direction: Unit vector (3,), world frame.
 
     Returns:
         Unit quaternion (4,), wxyz.
     """
-    start = torch.as_tensor(manipulator.rotation_wxyz).to(direction)
+    start = torch.as_tensor(tool.rotation_wxyz).to(direction)
     start = _unit(start)
-    if manipulator.thinnest_axis is None:
+    if tool.thinnest_axis is None:
         return start
     thinnest = torch.zeros_like(direction)
-    thinnest[manipulator.thinnest_axis] = 1.0
+    thinnest[tool.thinnest_axis] = 1.0
     return multiply(_shortest_turn(rotate(start, thinnest), direction), start)
 
 

@@ -62,7 +62,7 @@ class Proposer(abc.ABC):
             The variation, its score unknown; None where a tool would leave its bounds or reach into the body.
         """
         pose, generator = proposal.pose.clone(), stage.generator
-        for index, tool in enumerate(stage.scene.manipulators):
+        for index, tool in enumerate(stage.scene.tools):
             if tool.movable:
                 pose[index, :3] += (scale * torch.randn(3, generator=generator)).to(pose)
                 lower, upper = pose.new_tensor(tool.lower_bound), pose.new_tensor(tool.upper_bound)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from cpdeform.core.scene import Manipulator
+from cpdeform.core.scene import Tool
 from cpdeform.placement.pose import turned
 from cpdeform.placement.tool import placed_surface, tool_half_extents
 from cpdeform.placement.touch import CHUNK_DISTANCES, exit_distances
@@ -42,7 +42,7 @@ class PushSearch:
     the same place, and each pushes from the side that its clay is to leave.
 
     Args:
-        manipulators: The scene's tools.
+        tools: The scene's tools.
         particles: All particles (N, 3), length units.
         displacements: Where transport moves each of them (N, 3), length units.
         distance_scale: Length that distances d are measured in.
@@ -52,13 +52,13 @@ class PushSearch:
     def __init__(
         self,
         *,
-        manipulators: Sequence[Manipulator],
+        tools: Sequence[Tool],
         particles: Tensor,
         displacements: Tensor,
         distance_scale: float,
         clearance: float = 0.0,
     ) -> None:
-        self._manipulators, self._particles, self._clearance = manipulators, particles, clearance
+        self._tools, self._particles, self._clearance = tools, particles, clearance
         self._remaining, self._scale = displacements.to(particles).clone(), distance_scale
 
     def next(self, allowed: Tensor) -> Push | None:
@@ -93,8 +93,8 @@ class PushSearch:
         Returns:
             Its pose (8,); None where there is no room, or where it would have to pass through more clay than that of the push.
         """
-        tool, contact, direction = self._manipulators[index], self._particles[push.contact], push.direction
-        points = torch.cat([self._particles, *(placed_surface(self._manipulators[other], poses[other]) for other in obstacles)])
+        tool, contact, direction = self._tools[index], self._particles[push.contact], push.direction
+        points = torch.cat([self._particles, *(placed_surface(self._tools[other], poses[other]) for other in obstacles)])
         lower, upper = contact.new_tensor(tool.lower_bound), contact.new_tensor(tool.upper_bound)
         start = contact.clamp(lower, upper)
         for _ in range(3):

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate, Placer, PlacerCapabilities, Proposal, Stage
-from cpdeform.core.scene import Manipulator, Vector3
+from cpdeform.core.scene import Tool, Vector3
 from cpdeform.placement.grasp import TOOLS_PER_GRASP, GraspSearch
-from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulators
+from cpdeform.placement.grid import GridOptions, ToolGrid, movable_tools
 from cpdeform.placement.pose import GRASP_DIRECTIONS
 from cpdeform.placement.touch import reduce_distances
 
@@ -46,7 +46,7 @@ class PlacerRandom(Placer):
         Li et al., "Contact Points Discovery for Soft-Body Manipulations with Differentiable Physics", ICLR 2022.
     """
 
-    capabilities = PlacerCapabilities(needs_priorities=False, max_manipulators=None)
+    capabilities = PlacerCapabilities(needs_priorities=False, max_tools=None)
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class PlacerRandom(Placer):
         if stage is not self._stage:
             self._stage, self._round = stage, 0
         self._round += 1
-        movable = movable_manipulators(stage)
+        movable = movable_tools(stage)
         surface = surface_particles(stage.state.position[0].detach())
         placements = []
         for number in range(self.candidates):
@@ -101,9 +101,9 @@ class PlacerRandom(Placer):
 
     def _draw_grasps(self, stage: Stage, movable: Sequence[int], surface: Tensor, label: str) -> Proposal | None:
         particles = stage.state.position[0].detach()
-        search = GraspSearch(manipulators=stage.scene.manipulators, particles=particles, clearance=self.options.clearance)
-        poses, first = stage.state.manipulator_pose[0].detach().clone(), None
-        placed = [index for index in range(len(stage.scene.manipulators)) if index not in movable]
+        search = GraspSearch(tools=stage.scene.tools, particles=particles, clearance=self.options.clearance)
+        poses, first = stage.state.tool_pose[0].detach().clone(), None
+        placed = [index for index in range(len(stage.scene.tools)) if index not in movable]
         for start in range(0, len(movable), TOOLS_PER_GRASP):
             tools = movable[start : start + TOOLS_PER_GRASP]
             grasp = None
@@ -112,7 +112,7 @@ class PlacerRandom(Placer):
                 direction = torch.tensor(_draw_direction(stage.generator)).to(particles)
                 point = particles[particle]
 
-                def gap(tool: Manipulator, quaternion: Tensor, positions: Tensor, point: Tensor = point) -> Tensor:
+                def gap(tool: Tool, quaternion: Tensor, positions: Tensor, point: Tensor = point) -> Tensor:
                     return reduce_distances(tool, quaternion, positions, point.unsqueeze(0), lambda distance: distance[:, 0])
 
                 grasp = search.find(poses, tools, placed, point, direction, gap)

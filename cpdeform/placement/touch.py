@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.rotation import rotate_inverse
-from cpdeform.core.scene import Manipulator
+from cpdeform.core.scene import Tool
 from cpdeform.core.signed_distance import local_distance
 from cpdeform.placement.tool import tool_half_extents
 
@@ -29,12 +29,12 @@ GRAZING_DEPTH = 0.5
 
 
 def reduce_distances(
-    manipulator: Manipulator, quaternion: Tensor, positions: Tensor, points: Tensor, reduction: Callable[[Tensor], Tensor]
+    tool: Tool, quaternion: Tensor, positions: Tensor, points: Tensor, reduction: Callable[[Tensor], Tensor]
 ) -> Tensor:
     """Reduce the distances of points to a tool at each of several positions, in bounded memory.
 
     Args:
-        manipulator: The tool, at its start gap.
+        tool: The tool, at its start gap.
         quaternion: Its rotation (4,), unit quaternion wxyz.
         positions: Tool positions (G, 3), length units.
         points: Points (P, 3), length units.
@@ -48,11 +48,11 @@ def reduce_distances(
     parts = []
     for chunk in torch.split(rotate_inverse(quaternion, positions), step):
         axes = [point - origin.unsqueeze(-1) for point, origin in zip(local_points, chunk.unbind(-1), strict=True)]
-        parts.append(reduction(local_distance(manipulator, *axes)))
+        parts.append(reduction(local_distance(tool, *axes)))
     return torch.cat(parts) if parts else positions.new_empty(0)
 
 
-def smallest_gaps(manipulator: Manipulator, quaternion: Tensor, positions: Tensor, points: Tensor, *, reach: float = 0.0) -> Tensor:
+def smallest_gaps(tool: Tool, quaternion: Tensor, positions: Tensor, points: Tensor, *, reach: float = 0.0) -> Tensor:
     """Distance (G,) between a tool at each position (G, 3) and the nearest of the points (P, 3); exact up to `reach`.
 
     A larger distance may come out as infinity.
@@ -60,15 +60,15 @@ def smallest_gaps(manipulator: Manipulator, quaternion: Tensor, positions: Tenso
     if not positions.shape[0]:
         return positions.new_empty(0)
     # Only what lies in the box swept by the tool can be that near.
-    box = tool_half_extents(manipulator, quaternion) + reach
+    box = tool_half_extents(tool, quaternion) + reach
     near = ((points >= positions.amin(0) - box) & (points <= positions.amax(0) + box)).all(dim=-1)
     if not bool(near.any()):
         return torch.full_like(positions[:, 0], torch.inf)
-    return reduce_distances(manipulator, quaternion, positions, points[near], lambda distance: distance.amin(dim=-1))
+    return reduce_distances(tool, quaternion, positions, points[near], lambda distance: distance.amin(dim=-1))
 
 
 def exit_distances(
-    manipulator: Manipulator,
+    tool: Tool,
     quaternion: Tensor,
     starts: Tensor,
     direction: Tensor,
@@ -83,7 +83,7 @@ def exit_distances(
     has moved by that depth: such steps never pass over a gap that is wide enough for the tool.
 
     Args:
-        manipulator: The tool.
+        tool: The tool.
         quaternion: Its rotation (4,), unit quaternion wxyz.
         starts: Positions (G, 3) to start from, length units.
         direction: Unit vector (3,).
@@ -96,14 +96,14 @@ def exit_distances(
         hardly touches at its start.
     """
     lengths = torch.full_like(starts[:, 0], torch.inf)
-    depth = GRAZING_DEPTH * float(tool_half_extents(manipulator, quaternion).min())
-    gaps = smallest_gaps(manipulator, quaternion, starts, points)
+    depth = GRAZING_DEPTH * float(tool_half_extents(tool, quaternion).min())
+    gaps = smallest_gaps(tool, quaternion, starts, points)
     active = torch.nonzero(gaps <= -depth).flatten()
     moved, gaps, steps = torch.zeros_like(gaps)[active], gaps[active], torch.zeros_like(gaps)
 
     def gaps_at(lines: Tensor, distances: Tensor) -> Tensor:
         positions = starts[lines] + distances.unsqueeze(-1) * direction
-        return smallest_gaps(manipulator, quaternion, positions, points, reach=clearance)
+        return smallest_gaps(tool, quaternion, positions, points, reach=clearance)
 
     for _ in range(MOST_STEPS):
         step = (clearance - gaps).clamp(min=SMALLEST_STEP)

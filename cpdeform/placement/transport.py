@@ -8,7 +8,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.ot import TransportProblem
 from cpdeform.core.placer import LEAST_GAIN, Candidate, Placer, PlacerCapabilities, Proposal, Stage
 from cpdeform.placement.contact_search import ContactSearch, half_width
-from cpdeform.placement.grid import GridOptions, movable_manipulators
+from cpdeform.placement.grid import GridOptions, movable_tools
 from cpdeform.placement.priorities import Exploration
 from cpdeform.placement.proposer import Proposer
 from cpdeform.placement.proposers.names import default_proposers, make_proposers
@@ -63,10 +63,10 @@ class PlacerTransport(Placer):
 
     References:
         Li et al., "Contact Points Discovery for Soft-Body Manipulations with Differentiable Physics", ICLR 2022, sections
-        "Direct Single Manipulator Placement" and "Multiple Manipulator Placement With Heuristic".
+        "Direct Single Tool Placement" and "Multiple Tool Placement With Heuristic".
     """
 
-    capabilities = PlacerCapabilities(needs_priorities=True, max_manipulators=None)
+    capabilities = PlacerCapabilities(needs_priorities=True, max_tools=None)
 
     def __init__(
         self,
@@ -141,8 +141,8 @@ class PlacerTransport(Placer):
     def _search_of(self, stage: Stage) -> ContactSearch:
         """The search of a stage, begun anew for another stage."""
         if self._search is None or self._search.exploration.stage is not stage:
-            movable = movable_manipulators(stage)
-            narrowest = min(half_width(stage.scene.manipulators[index]) for index in movable)
+            movable = movable_tools(stage)
+            narrowest = min(half_width(stage.scene.tools[index]) for index in movable)
             self._search = ContactSearch(
                 exploration=Exploration.begin(stage, radius=EXPLORED_RADIUS * narrowest),
                 movable=tuple(movable),

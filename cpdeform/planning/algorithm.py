@@ -42,14 +42,14 @@ class Start:
 
     Attributes:
         state: The state, a single world.
-        target: Goal particles G (M, 3), length units.
+        goal: Goal particles G (M, 3), length units.
         first_stage: Number of the first stage.
         stages: Number of stages.
         previous: The stages before the first one, of a run that goes on.
     """
 
     state: State
-    target: Tensor
+    goal: Tensor
     first_stage: int
     stages: int
     previous: tuple[StageResult, ...] = ()
@@ -124,19 +124,19 @@ class Planner:
         check_tools_outside(self.task.scene, scene_start)
         state = scene_start if state is None else check_start(self.task, self.simulator, state)
         begun = time.perf_counter()
-        target = torch.as_tensor(self.task.load_target()).to(device=self.simulator.device, dtype=self.simulator.dtype)
+        goal = torch.as_tensor(self.task.load_goal()).to(device=self.simulator.device, dtype=self.simulator.dtype)
         for observer in self.observers:
-            observer.run_started(self.task, target, self.names, self.seed)
-        start = Start(state=state, target=target, first_stage=first_stage, stages=count, previous=tuple(previous))
+            observer.run_started(self.task, goal, self.names, self.seed)
+        start = Start(state=state, goal=goal, first_stage=first_stage, stages=count, previous=tuple(previous))
         results = []
         for result in (self.loop or contact_points_discovery)(self, start):
             results.append(result)
             for observer in self.observers:
                 observer.stage_finished(result)
-        metric = evaluate_metric(self.task, start=scene_start.position[0], final=results[-1].state.position[0], target=target)
+        metric = evaluate_metric(self.task, start=scene_start.position[0], final=results[-1].state.position[0], goal=goal)
         finished = DeformResult(
             task=self.task,
-            target=target,
+            goal=goal,
             stages=tuple(results),
             status=results[-1].status,
             loss_initial=results[0].loss_before,
@@ -218,7 +218,7 @@ class Planner:
         candidate = result.candidates[number]
         before = result.state_before
         trajectory = self.simulator.rollout(
-            before.with_manipulators(candidate.proposal.pose.unsqueeze(0)), candidate.actions.unsqueeze(0).to(before.position)
+            before.with_tools(candidate.proposal.pose.unsqueeze(0)), candidate.actions.unsqueeze(0).to(before.position)
         )
         if not is_finite(trajectory):
             return None
@@ -231,7 +231,7 @@ class Planner:
             best=number,
             actions=trajectory.actions[0],
             positions=trajectory.positions[0],
-            manipulator_poses=trajectory.manipulator_poses[0],
+            tool_poses=trajectory.tool_poses[0],
             loss=float(found.loss[0]),
             warm=found.warm,
         )
@@ -245,7 +245,7 @@ class Planner:
             index,
             self.task.scene,
             state,
-            start.target,
+            start.goal,
             None,
             generator,
             failed_contacts=failed,
@@ -263,7 +263,7 @@ class Planner:
         begin = self.objective.evaluate(still_trajectory(state, self.task.rollout_steps, scene=self.task.scene), warm)
         # "priorities f = optimal-transport potentials between current shape S_i and goal G"
         wanted = self.placer.transport_problem is not None
-        transport = self.ot_solver.solve(state.position[0], start.target) if wanted else None
+        transport = self.ot_solver.solve(state.position[0], start.goal) if wanted else None
         bench.stage, bench.warm = dataclasses.replace(stage, transport=transport, loss=float(begin.loss[0])), begin.warm
         bench.lap("transport")
         return bench
@@ -383,7 +383,7 @@ def _stage_result(
         best=None if trajectory is None else best,
         actions=None if trajectory is None else trajectory.actions[0],
         positions=None if trajectory is None else trajectory.positions[0],
-        manipulator_poses=None if trajectory is None else trajectory.manipulator_poses[0],
+        tool_poses=None if trajectory is None else trajectory.tool_poses[0],
         loss_before=bench.stage.loss,
         loss=execution.loss,
         gradient_evaluations=bench.gradient_evaluations,

@@ -89,7 +89,7 @@ class Evaluator:
         marks.append(time.perf_counter())
         gradient = None
         if result is not None:
-            gradient = self.simulator.vjp(trajectory, result.grad_positions, result.grad_manipulators).actions
+            gradient = self.simulator.vjp(trajectory, result.grad_positions, result.grad_tools).actions
         marks.append(time.perf_counter())
         loss = torch.where(finite, found.detach().double(), torch.nan).cpu()
         ends = trajectory.positions[:, -1].detach().clone()
@@ -167,4 +167,4 @@ def _held(trajectory: Trajectory, stand_ins: Tensor, finite: Tensor) -> Trajecto
     """
     held = stand_ins.unsqueeze(1).expand_as(trajectory.positions)
     positions = torch.where(finite[:, None, None, None], trajectory.positions, held)
-    return dataclasses.replace(trajectory, positions=positions, manipulator_poses=trajectory.manipulator_poses.nan_to_num())
+    return dataclasses.replace(trajectory, positions=positions, tool_poses=trajectory.tool_poses.nan_to_num())

@@ -33,10 +33,10 @@ def check_parts(task: Task, simulator: Simulator, placer: Placer, ot_solver: OTS
             f"{type(ot_solver).__name__} gives exact dual potentials, which are no transport priorities: where the shapes "
             "agree they are arbitrary. Choose a solver with entropic potentials, such as pot or geomloss."
         )
-    movable = sum(manipulator.movable for manipulator in task.scene.manipulators)
+    movable = sum(tool.movable for tool in task.scene.tools)
     if movable == 0:
-        raise InputError("scene.manipulators", came="no movable tool", expected="at least one with a positive action_scale")
-    most = placer.capabilities.max_manipulators
+        raise InputError("scene.tools", came="no movable tool", expected="at least one with a positive action_scale")
+    most = placer.capabilities.max_tools
     if most is not None and movable > most:
         raise CapabilityError(
             f"{type(placer).__name__} places at most {most} movable tools, the scene has {movable}; use the placer fixed."
@@ -72,12 +72,12 @@ def check_tools_outside(scene: Scene, state: State) -> None:
         scene: Its tools.
         state: The scene's start, a single world.
     """
-    for index, manipulator in enumerate(scene.manipulators):
-        depth = -float(signed_distance(manipulator, state.manipulator_pose[0, index], state.position[0]).min())
+    for index, tool in enumerate(scene.tools):
+        depth = -float(signed_distance(tool, state.tool_pose[0, index], state.position[0]).min())
         if depth > MAX_START_DEPTH:
             raise InputError(
-                f"scene.manipulators.{index}",
-                came=f"a {manipulator.kind} that starts {depth:.3g} length units deep inside the body",
+                f"scene.tools.{index}",
+                came=f"a {tool.kind} that starts {depth:.3g} length units deep inside the body",
                 expected=f"a tool outside of it (at most {MAX_START_DEPTH:g} deep)",
-                remedy=f"Change its position, for example with --set scene.manipulators.{index}.position=[x,y,z].",
+                remedy=f"Change its position, for example with --set scene.tools.{index}.position=[x,y,z].",
             )

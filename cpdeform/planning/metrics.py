@@ -37,14 +37,14 @@ class MetricValues:
     final: float
 
 
-def evaluate_metric(task: Task, *, start: Tensor, final: Tensor, target: Tensor, registry: Registry | None = None) -> MetricValues:
+def evaluate_metric(task: Task, *, start: Tensor, final: Tensor, goal: Tensor, registry: Registry | None = None) -> MetricValues:
     """Values of the task's metric.
 
     Args:
         task: Names the metric.
         start: Particles (N, 3) of the scene's start, length units.
         final: Particles (N, 3) at the end.
-        target: Goal particles (M, 3).
+        goal: Goal particles (M, 3).
         registry: Where the transport solver is looked up; defaults to the installed plugins.
 
     Returns:
@@ -52,19 +52,19 @@ def evaluate_metric(task: Task, *, start: Tensor, final: Tensor, target: Tensor,
         length units (less is better; nan, with a warning, where no transport solver is installed).
     """
     if task.metric == "incremental_iou":
-        first, last, goal = (positions.detach().cpu().double() for positions in (start, final, target))
-        goal_grid = target_mass_grid(task, goal)
+        first, last, wanted = (positions.detach().cpu().double() for positions in (start, final, goal))
+        goal_grid = goal_mass_grid(task, wanted)
         start_grid = mass_grid(first, task.scene)
-        values = [incremental_iou(grid, start=start_grid, target=goal_grid) for grid in (start_grid, mass_grid(last, task.scene))]
+        values = [incremental_iou(grid, start=start_grid, goal=goal_grid) for grid in (start_grid, mass_grid(last, task.scene))]
         return MetricValues(float(values[0]), float(values[1]))
     try:
         solver = metric_solver(registry=registry)
     except PluginError as error:
         warnings.warn(f"The metric is not known: {error}", stacklevel=2)
         return MetricValues(float("nan"), float("nan"))
-    initial = float(wasserstein(start, target, solver=solver).value)
+    initial = float(wasserstein(start, goal, solver=solver).value)
     unmoved = start.shape == final.shape and torch.equal(start.detach().cpu(), final.detach().cpu())
-    return MetricValues(initial, initial if unmoved else float(wasserstein(final, target, solver=solver).value))
+    return MetricValues(initial, initial if unmoved else float(wasserstein(final, goal, solver=solver).value))
 
 
 def metric_solver(*, solver: str = AUTO, blur: float = METRIC_BLUR, registry: Registry | None = None) -> OTSolver:
@@ -102,12 +102,12 @@ def wasserstein(first: Tensor, second: Tensor, *, solver: OTSolver) -> OTResult:
     return solver.solve(*clouds)
 
 
-def target_mass_grid(task: Task, target: Tensor) -> Tensor:
+def goal_mass_grid(task: Task, goal: Tensor) -> Tensor:
     """Node masses (G, G, G) of the goal: those in its own file where it has them, else its particles'.
 
     Args:
         task: Its file may hold node masses.
-        target: Goal particles (M, 3), length units.
+        goal: Goal particles (M, 3), length units.
     """
-    grid = task.load_target_grid()
-    return mass_grid(target, task.scene) if grid is None else torch.as_tensor(grid).to(target)
+    grid = task.load_goal_grid()
+    return mass_grid(goal, task.scene) if grid is None else torch.as_tensor(grid).to(goal)

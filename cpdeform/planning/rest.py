@@ -122,7 +122,7 @@ def rest(
     """
     _check_options(step_limit=step_limit, tolerance=tolerance, stray_share=stray_share)
     worlds = state.batch_size
-    current = state.with_manipulators(tools_away(state, simulator.scene)).to(device=simulator.device, dtype=simulator.dtype).clone()
+    current = state.with_tools(tools_away(state, simulator.scene)).to(device=simulator.device, dtype=simulator.dtype).clone()
     relaxations = [_Relaxation(simulator.scene) for _ in range(worlds)]
     active = list(range(worlds))
     for _ in range(step_limit):
@@ -141,7 +141,7 @@ def rest(
         if not active:
             break
     return Rest(
-        state=current.to(device=state.position.device, dtype=state.position.dtype).with_manipulators(state.manipulator_pose),
+        state=current.to(device=state.position.device, dtype=state.position.dtype).with_tools(state.tool_pose),
         steps=tuple(item.steps for item in relaxations),
         rests=tuple(item.rests for item in relaxations),
         residual=tuple(item.residual for item in relaxations),
@@ -211,8 +211,8 @@ def tools_away(state: State, scene: Scene) -> Tensor:
     Raises:
         InputError: A tool has no place within its bounds that is free of clay.
     """
-    poses = state.manipulator_pose.clone()
-    for index, tool in enumerate(scene.manipulators):
+    poses = state.tool_pose.clone()
+    for index, tool in enumerate(scene.tools):
         if not tool.movable:
             continue
         lower, upper = tool.lower_bound, tool.upper_bound
@@ -225,7 +225,7 @@ def tools_away(state: State, scene: Scene) -> Tensor:
             free = torch.nonzero(distances > CLEARANCE).flatten()
             if not len(free):
                 raise InputError(
-                    f"state: manipulators.{index}",
+                    f"state: tools.{index}",
                     came=f"clay within {CLEARANCE} of every corner of its bounds",
                     expected="a place free of clay",
                     remedy="Use a simulator of rest_scene(scene), which has no movable tools.",
@@ -244,8 +244,8 @@ def rest_scene(scene: Scene, *, particle_count: int | None = None) -> Scene:
     Raises:
         InputError: `particle_count` is below the number of bodies.
     """
-    tools = tuple(tool for tool in scene.manipulators if not tool.movable)
-    changed = scene.model_copy(update={"manipulators": tools})
+    tools = tuple(tool for tool in scene.tools if not tool.movable)
+    changed = scene.model_copy(update={"tools": tools})
     if particle_count is None or particle_count == scene.particle_count:
         return changed
     if particle_count < len(scene.bodies):
@@ -261,13 +261,13 @@ def rest_scene(scene: Scene, *, particle_count: int | None = None) -> Scene:
 
 def rest_state(state: State, scene: Scene) -> State:
     """A state of `scene` as one of `rest_scene(scene)`: the poses of its fixed tools alone."""
-    fixed = [index for index, tool in enumerate(scene.manipulators) if not tool.movable]
-    return state.with_manipulators(state.manipulator_pose[:, fixed])
+    fixed = [index for index, tool in enumerate(scene.tools) if not tool.movable]
+    return state.with_tools(state.tool_pose[:, fixed])
 
 
 def settle_goal(
     simulator: Simulator,
-    target: Tensor,
+    goal: Tensor,
     *,
     step_limit: int = STEP_LIMIT,
     tolerance: float = TOLERANCE,
@@ -278,31 +278,31 @@ def settle_goal(
 
     Args:
         simulator: A simulator of the scene with as many particles as the goal, such as one of `rest_scene`.
-        target: Goal particles (M, 3), length units; not modified.
+        goal: Goal particles (M, 3), length units; not modified.
         step_limit: As for `rest`.
         tolerance: As for `rest`.
         stray_share: As for `rest`.
         damped: As for `rest`.
 
     Raises:
-        InputError: `target` does not fit the simulator, or an option is out of range.
+        InputError: `goal` does not fit the simulator, or an option is out of range.
     """
     count = simulator.scene.particle_count
-    if target.shape != (count, 3):
+    if goal.shape != (count, 3):
         raise InputError(
-            "target",
-            came=f"shape {tuple(target.shape)}",
+            "goal",
+            came=f"shape {tuple(goal.shape)}",
             expected=f"shape ({count}, 3), the particles of the simulator's scene",
-            remedy="Make a simulator of rest_scene(scene, particle_count=len(target)).",
+            remedy="Make a simulator of rest_scene(scene, particle_count=len(goal)).",
         )
     start = initial_state(simulator.scene, device=simulator.device, dtype=simulator.dtype)
-    start = dataclasses.replace(start, position=target.detach().to(start.position).unsqueeze(0).contiguous())
+    start = dataclasses.replace(start, position=goal.detach().to(start.position).unsqueeze(0).contiguous())
     found = rest(simulator, start, step_limit=step_limit, tolerance=tolerance, stray_share=stray_share, damped=damped)
-    let_go = found.state.position[0].to(target)
+    let_go = found.state.position[0].to(goal)
     # A shape that collapses sinks farther on average than it can be put down whole.
-    room = float(target[:, 1].min()) - simulator.scene.domain[0][1]
-    drop = min(float((target - let_go)[:, 1].double().mean()), max(room, 0.0))
-    moved = target.detach().clone()
+    room = float(goal[:, 1].min()) - simulator.scene.domain[0][1]
+    drop = min(float((goal - let_go)[:, 1].double().mean()), max(room, 0.0))
+    moved = goal.detach().clone()
     moved[:, 1] -= drop
     return SettledGoal(
         position=moved,

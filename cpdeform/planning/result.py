@@ -66,7 +66,7 @@ class StageResult:
         best: Index of the executed candidate; None where none was executed.
         actions: Executed actions (T, A); None where none was executed.
         positions: Particle positions (T+1, N, 3) during the execution; None where none was executed.
-        manipulator_poses: Tool poses (T+1, M, 8) during the execution; None where none was executed.
+        tool_poses: Tool poses (T+1, M, 8) during the execution; None where none was executed.
         loss_before: Loss of leaving the state as it is.
         loss: Loss of the executed plan; `loss_before` where none was executed.
         gradient_evaluations: Gradient evaluations of this stage, all worlds.
@@ -86,7 +86,7 @@ class StageResult:
     best: int | None
     actions: Tensor | None
     positions: Tensor | None
-    manipulator_poses: Tensor | None
+    tool_poses: Tensor | None
     loss_before: float
     loss: float
     gradient_evaluations: int
@@ -102,7 +102,7 @@ class DeformResult:
 
     Attributes:
         task: What was asked for.
-        target: Goal particles (M, 3), length units.
+        goal: Goal particles (M, 3), length units.
         stages: Every stage, in order.
         status: Status of the last stage.
         loss_initial: Loss before the first stage, objective units.
@@ -118,7 +118,7 @@ class DeformResult:
     """
 
     task: Task
-    target: Tensor
+    goal: Tensor
     stages: tuple[StageResult, ...]
     status: Status
     loss_initial: float
@@ -147,7 +147,7 @@ class DeformResult:
 class Observer:
     """Base of observers of a run; every method does nothing until overridden."""
 
-    def run_started(self, task: Task, target: Tensor, names: dict[str, str], seed: int) -> None:
+    def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
         """The parts are ready and checked."""
 
     def optimization_started(self, stage: int, worlds: int, memory_estimate: int) -> None:

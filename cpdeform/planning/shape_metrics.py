@@ -78,25 +78,25 @@ class GoalShape:
     """A goal that results are compared with; what depends on the goal alone is computed once.
 
     Args:
-        target: Goal particles (M, 3), length units, in the domain.
+        goal: Goal particles (M, 3), length units, in the domain.
         scene: Its grid is the one that cells belong to.
         sample_size: Particles N of the results, for the ceiling; defaults to M.
         seed: Seed of the samples behind the ceiling.
 
     Raises:
-        InputError: `target` is empty, of another shape, or not inside the domain; or `sample_size` is not positive.
+        InputError: `goal` is empty, of another shape, or not inside the domain; or `sample_size` is not positive.
     """
 
-    def __init__(self, target: Tensor, scene: Scene, *, sample_size: int | None = None, seed: int = 0) -> None:
-        if target.ndim != 2 or target.shape[1:] != (3,) or not len(target):
-            raise InputError("target", came=f"shape {tuple(target.shape)}", expected="shape (M, 3) with M >= 1")
+    def __init__(self, goal: Tensor, scene: Scene, *, sample_size: int | None = None, seed: int = 0) -> None:
+        if goal.ndim != 2 or goal.shape[1:] != (3,) or not len(goal):
+            raise InputError("goal", came=f"shape {tuple(goal.shape)}", expected="shape (M, 3) with M >= 1")
         if sample_size is not None and sample_size < 1:
             raise InputError("sample_size", came=str(sample_size), expected="at least 1 particle")
         self.scene = scene
-        self.target = target.detach().cpu().double()
-        self.sample_size = sample_size or len(target)
+        self.position = goal.detach().cpu().double()
+        self.sample_size = sample_size or len(goal)
         self.seed = seed
-        share = mass_share(self.target, scene)
+        share = mass_share(self.position, scene)
         self.usual_mass = usual_mass(share)
         self.cells: Cells = share > LOOSE_FRACTION * self.usual_mass
 
@@ -222,16 +222,16 @@ def _ceilings(goal: GoalShape) -> tuple[float, float]:
     particle cloud, and continued to the variance of goal and result as the power of the variance that the two tell.
     """
     generator = torch.Generator().manual_seed(goal.seed)
-    count = len(goal.target)
+    count = len(goal.position)
     if count < 8:
         return math.nan, 0.0
-    gaps = _neighbour_distances(goal.target)
+    gaps = _neighbour_distances(goal.position)
     if gaps.std() < EVEN_SPREAD * gaps.mean():
         samples = [_resampled(goal, float(gaps.mean()), generator) for _ in range(RESAMPLES)]
         loose = [goal.raw_loose_share(sample) for sample in samples]
         return float(np.mean([goal.iou(sample) for sample in samples])), float(np.mean(loose))
     misfits = {part: _part_misfit(goal, count // part, generator) for part in (2, 4)}
-    loose_floor = goal.raw_loose_share(goal.target)
+    loose_floor = goal.raw_loose_share(goal.position)
     if misfits[2] <= 0.0 or misfits[4] <= 0.0:
         return 1.0, loose_floor
     exponent = math.log2(misfits[4] / misfits[2])
@@ -241,7 +241,7 @@ def _ceilings(goal: GoalShape) -> tuple[float, float]:
 
 def _resampled(goal: GoalShape, gap: float, generator: torch.Generator) -> Tensor:
     """A random sample (N, 3) of an evenly spread goal."""
-    drawn = goal.target[torch.randint(len(goal.target), (goal.sample_size,), generator=generator)]
+    drawn = goal.position[torch.randint(len(goal.position), (goal.sample_size,), generator=generator)]
     offset = torch.rand(drawn.shape, generator=generator, dtype=drawn.dtype) - 0.5
     # Only the domain's own faces bound it: a sample must stay on the grid.
     return (drawn + JITTER * gap * offset).clamp(0.0, 1.0)
@@ -251,8 +251,8 @@ def _part_misfit(goal: GoalShape, size: int, generator: torch.Generator) -> floa
     """Mean of 1 - IoU between two random parts of the goal, of `size` particles each."""
     misfits = []
     for _ in range(RESAMPLES):
-        order = torch.randperm(len(goal.target), generator=generator)
-        first, second = goal.target[order[:size]], goal.target[order[size : 2 * size]]
+        order = torch.randperm(len(goal.position), generator=generator)
+        first, second = goal.position[order[:size]], goal.position[order[size : 2 * size]]
         misfits.append(1.0 - intersection_over_union(goal.occupied(first), goal.occupied(second)))
     return float(np.mean(misfits))
 

@@ -20,7 +20,7 @@ def still_trajectory(state: State, step_count: int, *, scene: Scene) -> Trajecto
     positions[:, -2] = (state.position - seconds * state.velocity).clamp(0.0, 1.0)
     return Trajectory(
         positions=positions,
-        manipulator_poses=state.manipulator_pose.unsqueeze(1).expand(-1, step_count + 1, -1, -1),
+        tool_poses=state.tool_pose.unsqueeze(1).expand(-1, step_count + 1, -1, -1),
         actions=torch.zeros(worlds, step_count, scene.action_size, dtype=state.position.dtype, device=state.position.device),
         initial_state=state,
         final_state=state,

@@ -120,7 +120,7 @@ class Workbench:
     def worlds(self, candidates: Sequence[Candidate]) -> State:
         """The stage's state in a world for each candidate, tools placed."""
         poses = torch.stack([candidate.proposal.pose for candidate in candidates])
-        return self.stage.state.fork(len(candidates)).with_manipulators(poses)
+        return self.stage.state.fork(len(candidates)).with_tools(poses)
 
     def minimize(
         self, candidates: Sequence[Candidate], optimizer: TrajectoryOptimizer, objective: Objective | None, *, phase: str
@@ -199,7 +199,7 @@ class Workbench:
             The trajectory, its loss, and what the objective can start from at its end. The loss is nan where the rollout leaves
             the finite numbers, if only in a velocity or strain at its end: no stage can begin there.
         """
-        start = self.stage.state.with_manipulators(candidate.proposal.pose.unsqueeze(0))
+        start = self.stage.state.with_tools(candidate.proposal.pose.unsqueeze(0))
         trajectory = self.simulator.rollout(start, candidate.actions.unsqueeze(0).to(start.position))
         self.rollouts += 1
         if not is_finite(trajectory):
@@ -220,5 +220,5 @@ class Workbench:
 
 def is_finite(trajectory: Trajectory) -> bool:
     """Whether a trajectory and all of its final state are finite."""
-    tensors = (trajectory.positions, trajectory.manipulator_poses, *state_tensors(trajectory.final_state))
+    tensors = (trajectory.positions, trajectory.tool_poses, *state_tensors(trajectory.final_state))
     return all(bool(torch.isfinite(tensor).all()) for tensor in tensors)

@@ -72,12 +72,12 @@ def _draw_frames(record: RunRecord, view: View, frames: list[tuple[int, int]]) -
     canvas: Any = FigureCanvasAgg(figure)
     for number, step in frames:
         stage = record.stages[number]
-        if stage.positions is None or stage.manipulator_poses is None:
+        if stage.positions is None or stage.tool_poses is None:
             continue
         figure.clear()
         axis = figure.add_axes((0.0, 0.0, 1.0, 0.93))
         particles = stage.positions[step].double().numpy()
-        tools = tool_surfaces(record, stage.manipulator_poses[step].double().numpy())
+        tools = tool_surfaces(record, stage.tool_poses[step].double().numpy())
         draw_scene(axis, view, particles, clay_colours(view, particles), tools, width=560, quality=1)
         text = (
             f"{record.task.name}   stage {stage.index + 1}/{record.stages[-1].index + 1}   step {step}/{len(stage.positions) - 1}"

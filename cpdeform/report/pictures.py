@@ -57,14 +57,14 @@ def draw_picture(record: RunRecord) -> Path:
     axes = figure.subplots(1, 4)
     stage, last = _shown_stage(record), record.stages[-1]
     start, result = record.stages[0].state_before, last.state
-    placed = stage.candidates[stage.best].proposal.pose if stage.best is not None else stage.state_before.manipulator_pose[0]
-    _draw_panel(axes[0], view, record, "start", start.position[0], start.manipulator_pose[0])
+    placed = stage.candidates[stage.best].proposal.pose if stage.best is not None else stage.state_before.tool_pose[0]
+    _draw_panel(axes[0], view, record, "start", start.position[0], start.tool_pose[0])
     _draw_priorities(figure, axes[1], view, record, stage, placed)
     title = "result" if last.status.executed or record.finished_stages else "result (no plan was executed)"
-    _draw_panel(axes[2], view, record, title, result.position[0], result.manipulator_pose[0])
+    _draw_panel(axes[2], view, record, title, result.position[0], result.tool_pose[0])
     # The goal often has another number of particles than the body.
-    target_view = dataclasses.replace(view, radius=_particle_radius(_numbers(record.target)))
-    _draw_panel(axes[3], target_view, record, "target", record.target, None)
+    goal_view = dataclasses.replace(view, radius=_particle_radius(_numbers(record.goal)))
+    _draw_panel(axes[3], goal_view, record, "goal", record.goal, None)
     _add_height_bar(figure, axes, view)
     figure.suptitle(describe(record), fontsize=13)
     path = record.directory / "picture.png"
@@ -91,9 +91,9 @@ def make_view(record: RunRecord) -> View:
     """
     if not record.stages:
         raise InputError(f"run record {record.directory}", came="no complete stage", expected="at least one to draw")
-    target = record.target.double().numpy()
-    clouds = [target] + [_numbers(state.position[0]) for stage in record.stages for state in (stage.state_before, stage.state)]
-    poses = [_numbers(state.manipulator_pose[0]) for stage in record.stages for state in (stage.state_before, stage.state)]
+    goal = record.goal.double().numpy()
+    clouds = [goal] + [_numbers(state.position[0]) for stage in record.stages for state in (stage.state_before, stage.state)]
+    poses = [_numbers(state.tool_pose[0]) for stage in record.stages for state in (stage.state_before, stage.state)]
     poses += [_numbers(stage.candidates[stage.best].proposal.pose) for stage in record.stages if stage.best is not None]
     shapes = [surface.reshape(-1, 3) for pose in poses for surface in tool_surfaces(record, pose, rows=16, columns=32)]
     everything = np.concatenate(clouds + shapes)
@@ -109,7 +109,7 @@ def make_view(record: RunRecord) -> View:
 
 def tool_surfaces(record: RunRecord, poses: Array, *, rows: int = 220, columns: int = 320) -> list[Array]:
     """Surfaces (R, C, 3) of all tools of a run at the poses (M, 8)."""
-    tools = record.task.scene.manipulators
+    tools = record.task.scene.tools
     return [tool_surface(tool, pose, rows=rows, columns=columns) for tool, pose in zip(tools, poses, strict=True)]
 
 

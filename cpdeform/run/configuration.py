@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from cpdeform.core.bounded import (
     MOST_COUNT,
@@ -20,6 +20,7 @@ from cpdeform.core.bounded import (
     Whole,
 )
 from cpdeform.core.errors import InputError
+from cpdeform.core.old_names import current_options
 from cpdeform.core.plugins import AUTO
 from cpdeform.core.scene import FrozenModel
 from cpdeform.planning.objectives.contact import ContactKind
@@ -117,7 +118,7 @@ class RunConfiguration(FrozenModel):
         stages: Number of stages; defaults to the task's own.
         steps: Environment steps of a stage; defaults to the task's own.
         rest_steps: Environment steps of rest after them; defaults to the task's own.
-        target: File of the goal instead of the task's own, e.g. one written by `cpdeform task import-grid`.
+        goal: File of the goal instead of the task's own, e.g. one written by `cpdeform task import-grid`.
         strategy: Registered name of the strategy: ``"cpdeform"``, or ``"paper"`` for Algorithm 1 to the letter. What it sets, the
             user overrides.
         optimizer: Options of the optimiser.
@@ -140,7 +141,7 @@ class RunConfiguration(FrozenModel):
     stages: Whole | None = Field(default=None, ge=1, le=MOST_STAGES)
     steps: Whole | None = Field(default=None, ge=1, le=MOST_STEPS)
     rest_steps: Whole | None = Field(default=None, ge=0, le=MOST_STEPS)
-    target: Path | None = None
+    goal: Path | None = None
     strategy: str = DEFAULT_STRATEGY
     optimizer: OptimizerConfiguration = OptimizerConfiguration()
     objective: ObjectiveConfiguration = ObjectiveConfiguration()
@@ -151,6 +152,11 @@ class RunConfiguration(FrozenModel):
     ot_options: dict[str, Any] = Field(default_factory=dict)
     placer_options: dict[str, Any] = Field(default_factory=dict)
     strategy_options: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_old_names(cls, content: Any) -> Any:
+        return current_options(content)
 
     @field_validator("device")
     @classmethod

@@ -23,10 +23,9 @@ from cpdeform.core.ot import OTSolver
 from cpdeform.core.plugins import AUTO, Registry, load_registry
 from cpdeform.core.sampling import sample_particles
 from cpdeform.core.task import Task
-from cpdeform.planning.metrics import EVEN_SPREAD, metric_solver, target_mass_grid, wasserstein
+from cpdeform.planning.metrics import EVEN_SPREAD, goal_mass_grid, metric_solver, wasserstein
 from cpdeform.planning.objectives.mass import mass_grid
 from cpdeform.planning.objectives.metrics import incremental_iou, soft_iou
-from cpdeform.run.record_files import TARGET_FILE
 from cpdeform.run.record_reader import RunRecord
 
 PAPER_BLUR = {"single": 1e-3, "multiple": 1e-5}
@@ -46,11 +45,11 @@ class Evaluation:
     Attributes:
         task: Name of the task.
         particle_count: Particles N of the body.
-        target_count: Particles M of the goal.
+        goal_count: Particles M of the goal.
         iou_start: Soft IoU of the start's node masses with the goal's.
         iou_final: That of the end.
-        iou_target: That of the goal with itself, the most that can be reached.
-        incremental_iou: Normalised incremental IoU, the part of the way from `iou_start` to `iou_target`, in [0, 1].
+        iou_goal: That of the goal with itself, the most that can be reached.
+        incremental_iou: Normalised incremental IoU, the part of the way from `iou_start` to `iou_goal`, in [0, 1].
         grid: Where the goal's node masses come from: its ``"file"``, or its ``"particles"``.
         wasserstein_start: Wasserstein-1 distance of the start from the goal, ``converged``.
         wasserstein_final: That of the end.
@@ -72,10 +71,10 @@ class Evaluation:
 
     task: str
     particle_count: int
-    target_count: int
+    goal_count: int
     iou_start: float
     iou_final: float
-    iou_target: float
+    iou_goal: float
     incremental_iou: float
     grid: Literal["file", "particles"]
     wasserstein_start: float
@@ -100,7 +99,7 @@ def evaluate(
     *,
     start: Tensor,
     final: Tensor,
-    target: Tensor,
+    goal: Tensor,
     solver: OTSolver | str = AUTO,
     paper: bool = False,
     paper_blur: float | None = None,
@@ -113,7 +112,7 @@ def evaluate(
         task: Gives the scene, and the goal's node masses if its file has them.
         start: Particles (N, 3) of the scene's start, length units.
         final: Particles (N, 3) at the end.
-        target: Goal particles (M, 3).
+        goal: Goal particles (M, 3).
         solver: The transport solver of ``converged``, as `metric_solver` makes it, or its registered name.
         paper: Whether to compute the ``paper`` distance, too (about two minutes for 10,000 particles).
         paper_blur: Its blur; defaults to 1e-3, or 1e-5 for a task of several stages, as in the paper.
@@ -125,32 +124,32 @@ def evaluate(
         MissingExtraError: `paper` needs GeomLoss, which is not installed.
     """
     registry = registry or load_registry()
-    start, final, target = (positions.detach().cpu().double() for positions in (start, final, target))
+    start, final, goal = (positions.detach().cpu().double() for positions in (start, final, goal))
     used = metric_solver(solver=solver, registry=registry) if isinstance(solver, str) else solver
     seconds: dict[str, float] = {}
     began = time.perf_counter()
-    figures = _iou_figures(task, start, final, target)
+    figures = _iou_figures(task, start, final, goal)
     began = _lap(seconds, "iou", began)
-    results = [wasserstein(positions, target, solver=used) for positions in (start, final)]
+    results = [wasserstein(positions, goal, solver=used) for positions in (start, final)]
     began = _lap(seconds, "wasserstein", began)
-    corresponds = task.target_corresponds()
-    floor = 0.0 if corresponds else sampling_floor(target, distance=lambda *clouds: float(wasserstein(*clouds, solver=used).value))
+    corresponds = task.goal_corresponds()
+    floor = 0.0 if corresponds else sampling_floor(goal, distance=lambda *clouds: float(wasserstein(*clouds, solver=used).value))
     began = _lap(seconds, "floor", began)
     if paper:
         figures["paper_blur"] = paper_blur or PAPER_BLUR["multiple" if task.stage_count > 1 else "single"]
         measure = functools.partial(paper_wasserstein, blur=figures["paper_blur"], registry=registry)
-        figures["paper_start"], figures["paper_final"] = (measure(cloud, target) for cloud in (start, final))
-        figures["paper_floor"] = 0.0 if corresponds else sampling_floor(target, distance=measure)
+        figures["paper_start"], figures["paper_final"] = (measure(cloud, goal) for cloud in (start, final))
+        figures["paper_floor"] = 0.0 if corresponds else sampling_floor(goal, distance=measure)
         began = _lap(seconds, "paper", began)
     if exact:
         (figures["exact_start"], _), (figures["exact_final"], figures["exact_method"]) = (
-            exact_wasserstein(cloud, target, registry=registry) for cloud in (start, final)
+            exact_wasserstein(cloud, goal, registry=registry) for cloud in (start, final)
         )
         _lap(seconds, "exact", began)
     return Evaluation(
         task=task.name,
         particle_count=len(final),
-        target_count=len(target),
+        goal_count=len(goal),
         wasserstein_start=float(results[0].value),
         wasserstein_final=float(results[1].value),
         wasserstein_blur=results[1].blur,
@@ -173,12 +172,11 @@ def evaluate_record(record: RunRecord, **options: Any) -> Evaluation:
     Raises:
         InputError: No stage of the run is complete.
     """
-    task = record.task.model_copy(update={"target": record.directory / TARGET_FILE})
-    start = torch.as_tensor(sample_particles(task.scene))
-    return evaluate(task, start=start, final=record.state.position[0], target=record.target, **options)
+    start = torch.as_tensor(sample_particles(record.task.scene))
+    return evaluate(record.task, start=start, final=record.state.position[0], goal=record.goal, **options)
 
 
-def sampling_floor(target: Tensor, *, distance: Callable[[Tensor, Tensor], float], seed: int = 0) -> float:
+def sampling_floor(goal: Tensor, *, distance: Callable[[Tensor, Tensor], float], seed: int = 0) -> float:
     """Expected Wasserstein-1 distance of a random sample of a shape, of as many particles as the goal has, from the goal.
 
     Estimated from the goal alone. Where it is a random sample itself, by the distance between two random halves of it, which
@@ -190,7 +188,7 @@ def sampling_floor(target: Tensor, *, distance: Callable[[Tensor, Tensor], float
     Several bodies that do not touch share out their particles at random in both, which a plan does not: it is too high for them.
 
     Args:
-        target: Goal particles (M, 3), length units.
+        goal: Goal particles (M, 3), length units.
         distance: Distance between two clouds (M, 3), (M', 3).
         seed: Seed of the sample.
 
@@ -201,18 +199,18 @@ def sampling_floor(target: Tensor, *, distance: Callable[[Tensor, Tensor], float
         .. [1] Fournier & Guillin, "On the rate of convergence in Wasserstein distance of the empirical measure", Probability
            Theory and Related Fields, 2015.
     """
-    count = len(target)
+    count = len(goal)
     if count < 2:
         return float("nan")
     generator = torch.Generator().manual_seed(seed)
-    gaps = _neighbour_distances(target)
+    gaps = _neighbour_distances(goal)
     if float(gaps.std()) < EVEN_SPREAD * float(gaps.mean()):
-        drawn = target[torch.randint(count, (count,), generator=generator)]
-        offset = torch.rand(drawn.shape, generator=generator, dtype=target.dtype) - 0.5
-        return distance(drawn + float(gaps.mean()) * offset.to(target), target)
+        drawn = goal[torch.randint(count, (count,), generator=generator)]
+        offset = torch.rand(drawn.shape, generator=generator, dtype=goal.dtype) - 0.5
+        return distance(drawn + float(gaps.mean()) * offset.to(goal), goal)
     half = count // 2
     order = torch.randperm(count, generator=generator)
-    return distance(target[order[:half]], target[order[half : 2 * half]]) * math.pow(2.0, -1.0 / 3.0)
+    return distance(goal[order[:half]], goal[order[half : 2 * half]]) * math.pow(2.0, -1.0 / 3.0)
 
 
 def _neighbour_distances(points: Tensor) -> Tensor:
@@ -273,15 +271,15 @@ def _network_simplex(first: Tensor, second: Tensor) -> float:
     return float(ot.emd2([], [], cost, numItermax=100_000_000))
 
 
-def _iou_figures(task: Task, start: Tensor, final: Tensor, target: Tensor) -> dict[str, Any]:
-    goal = target_mass_grid(task, target)
+def _iou_figures(task: Task, start: Tensor, final: Tensor, goal: Tensor) -> dict[str, Any]:
+    goal_grid = goal_mass_grid(task, goal)
     first, last = (mass_grid(positions, task.scene) for positions in (start, final))
     return {
-        "iou_start": float(soft_iou(first, goal)),
-        "iou_final": float(soft_iou(last, goal)),
-        "iou_target": float(soft_iou(goal, goal)),
-        "incremental_iou": float(incremental_iou(last, start=first, target=goal)),
-        "grid": "particles" if task.load_target_grid() is None else "file",
+        "iou_start": float(soft_iou(first, goal_grid)),
+        "iou_final": float(soft_iou(last, goal_grid)),
+        "iou_goal": float(soft_iou(goal_grid, goal_grid)),
+        "incremental_iou": float(incremental_iou(last, start=first, goal=goal_grid)),
+        "grid": "particles" if task.load_goal_grid() is None else "file",
     }
 
 

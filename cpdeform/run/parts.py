@@ -14,7 +14,7 @@ from cpdeform.core.plugins import Registry
 from cpdeform.core.priorities import DISPLACEMENT_EXPONENT
 from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
-from cpdeform.planning.metrics import target_mass_grid
+from cpdeform.planning.metrics import goal_mass_grid
 from cpdeform.planning.objectives.density import ObjectiveDensity
 from cpdeform.planning.objectives.mass import mass_grid
 from cpdeform.planning.objectives.plasticinelab import ObjectivePlasticineLab
@@ -84,18 +84,18 @@ def make_objective(
     """The loss that a configuration describes.
 
     Args:
-        task: Its target is the goal.
+        task: Its goal is wanted.
         ot_solver: A solver used as it is, or a registered name, created with the blur of `options`.
         simulator: Gives device and type.
         registry: Where the name is looked up.
         options: Kind, subset size, blur, refresh schedule, contact weight.
     """
-    target = torch.as_tensor(task.load_target()).to(device=simulator.device, dtype=simulator.dtype)
+    goal = torch.as_tensor(task.load_goal()).to(device=simulator.device, dtype=simulator.dtype)
     if options.kind == "plasticinelab":
-        grid = task.load_target_grid()
+        grid = task.load_goal_grid()
         return ObjectivePlasticineLab(
             task.scene,
-            mass_grid(target, task.scene) if grid is None else torch.as_tensor(grid).to(target),
+            mass_grid(goal, task.scene) if grid is None else torch.as_tensor(grid).to(goal),
             contact_weight=1.0 if options.contact_weight is None else options.contact_weight,
             contact=options.contact,
         )
@@ -104,7 +104,7 @@ def make_objective(
         solver = _named_solver(solver, blur=options.blur, registry=registry)
     transport = ObjectiveTransport(
         solver,
-        target,
+        goal,
         scene=task.scene,
         points=options.points,
         refresh=options.refresh,
@@ -115,7 +115,7 @@ def make_objective(
     if options.kind == "transport":
         return transport
     start = simulator.initial_state(batch_size=1).position[0]
-    return ObjectiveShape(transport, task.scene, target, start, density_weight=options.density_weight)
+    return ObjectiveShape(transport, task.scene, goal, start, density_weight=options.density_weight)
 
 
 def make_refinement(
@@ -131,7 +131,7 @@ def make_refinement(
     """Loss and optimiser of the refinement that a configuration describes; None for none.
 
     Args:
-        task: Its target is the goal, with the node masses of its file where it has them.
+        task: Its goal is wanted, with the node masses of its file where it has them.
         ot_solver: As for `make_objective`; for the kind ``"transport"``.
         simulator: Gives device and type.
         options: Kind, iterations, step size, patience.
@@ -147,7 +147,7 @@ def make_refinement(
         plain = ObjectiveConfiguration(points=None, blur=blur)
         objective = make_objective(task, ot_solver, simulator, options=plain, registry=registry)
     else:
-        grid = target_mass_grid(task, torch.as_tensor(task.load_target()).double())
+        grid = goal_mass_grid(task, torch.as_tensor(task.load_goal()).double())
         objective = ObjectiveSoftIoU(task.scene, grid) if options.kind == "iou" else ObjectiveDensity(task.scene, grid)
     optimizer = TrajectoryOptimizer(iterations=iterations, learning_rate=options.learning_rate, patience=options.patience)
     return objective, optimizer

@@ -11,7 +11,7 @@
     A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage.
 ``.run.lock``
     Number of the process that writes, while it does.
-``target.h5``, ``stage-000.h5``, ...
+``goal.h5``, ``stage-000.h5``, ...
     The goal, and each finished stage; the attributes of every dataset say what it holds.
 """
 
@@ -37,9 +37,9 @@ from cpdeform.planning.optimizer import Iteration
 from cpdeform.planning.result import DeformResult, Observer, StageResult, Status
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record_files import (
+    GOAL_FILE,
     METRICS_FILE,
     RUN_FILE,
-    TARGET_FILE,
     check_directory,
     environment,
     own_files,
@@ -55,7 +55,7 @@ from cpdeform.run.record_stage import write_stage
 
 __all__ = ["RunRecord", "RunRecorder", "load_record", "save_result"]
 
-FORMAT = 2
+FORMAT = 3
 """Version of the record's layout."""
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -112,7 +112,7 @@ class RunRecorder(Observer):
         """Whether there is a record."""
         return bool(self._run)
 
-    def run_started(self, task: Task, target: Tensor, names: dict[str, str], seed: int) -> None:
+    def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
         """Begin the record: everything that is known before the first stage."""
         check_directory(self.directory, overwrite=self._overwrite)
         with self._writing():
@@ -135,10 +135,10 @@ class RunRecorder(Observer):
                 **environment(),
                 "configuration": self._configuration.model_dump(mode="json") if self._configuration else None,
                 # The goal is the copy beside this file.
-                "task": {**task.model_dump(mode="json"), "target": TARGET_FILE},
+                "task": {**task.model_dump(mode="json"), "goal": GOAL_FILE},
             }
-            with replacing_hdf5(self.directory / TARGET_FILE) as file:
-                write_dataset(file, "position", target, shape="particle, xyz", units="length (domain edge = 1)")
+            with replacing_hdf5(self.directory / GOAL_FILE) as file:
+                write_dataset(file, "position", goal, shape="particle, xyz", units="length (domain edge = 1)")
                 _write_goal_extras(file, task)
             (self.directory / METRICS_FILE).write_text("", encoding="utf-8")
             self._write_run()
@@ -257,9 +257,9 @@ class RunRecorder(Observer):
 
 def _write_goal_extras(file: h5py.File, task: Task) -> None:
     """Keep what else the goal's file says, so that a run which goes on is judged by the same goal."""
-    corresponds = torch.tensor(task.target_corresponds())
+    corresponds = torch.tensor(task.goal_corresponds())
     write_dataset(file, "corresponds", corresponds, shape="", units="whether the particles are the body's, one to one, moved")
-    grid = task.load_target_grid()
+    grid = task.load_goal_grid()
     if grid is not None:
         cells = torch.nonzero(torch.as_tensor(grid))
         write_dataset(file, "grid_cells", cells, shape="node, axis", units="index of a grid node")
@@ -299,7 +299,7 @@ def save_result(
         RecordError: Writing failed on the way, e.g. because the disk is full.
     """
     recorder = RunRecorder(directory, configuration=configuration, overwrite=overwrite, resumed_from=resumed_from)
-    recorder.run_started(result.task, result.target, result.names, result.seed)
+    recorder.run_started(result.task, result.goal, result.names, result.seed)
     for stage in result.stages:
         for iteration in stage.history:
             recorder.iteration_finished(stage.index, iteration)

@@ -22,9 +22,12 @@ from cpdeform.run.record_lock import LOCK_FILE
 
 RUN_FILE = "run.json"
 METRICS_FILE = "metrics.jsonl"
-TARGET_FILE = "target.h5"
+GOAL_FILE = "goal.h5"
+OLD_GOAL_FILE = "target.h5"
+"""What it was called up to format 2."""
+
 STAGE_PATTERN = re.compile(r"stage-(\d{3,})\.h5")
-OWN_FILES = (RUN_FILE, METRICS_FILE, TARGET_FILE, "picture.png", "animation.mp4", "animation.gif")
+OWN_FILES = (RUN_FILE, METRICS_FILE, GOAL_FILE, OLD_GOAL_FILE, "picture.png", "animation.mp4", "animation.gif")
 """Files, besides the stages', that `overwrite` may remove; pictures are among them since they would show the old run."""
 
 PACKAGES = ("cpdeform", "torch", "warp-lang", "taichi", "pot", "geomloss", "numpy", "h5py")

@@ -20,8 +20,8 @@ from cpdeform.core.reading.models import validate
 from cpdeform.core.state import State
 from cpdeform.core.task import Task
 from cpdeform.planning.result import StageResult
-from cpdeform.run.migration import current_task
-from cpdeform.run.record_files import METRICS_FILE, RUN_FILE, TARGET_FILE, stage_files
+from cpdeform.run.migration import current_task, goal_file
+from cpdeform.run.record_files import METRICS_FILE, RUN_FILE, stage_files
 from cpdeform.run.record_stage import read_stage
 
 MOST_FORMAT = 1000
@@ -39,7 +39,7 @@ class RunRecord:
         directory: Where it lies.
         run: Content of ``run.json``: status, versions, machine, configuration, losses; null for a number that is not finite.
         task: What was asked for; its goal is the record's copy.
-        target: Goal particles (M, 3), length units.
+        goal: Goal particles (M, 3), length units.
         metrics: Lines of ``metrics.jsonl``, iterations and stages in the order of time.
         stages: Stages that are complete, in order; their `history` is empty, see `metrics`.
     """
@@ -47,7 +47,7 @@ class RunRecord:
     directory: Path
     run: dict[str, Any]
     task: Task
-    target: Tensor
+    goal: Tensor
     metrics: tuple[dict[str, Any], ...]
     stages: tuple[StageResult, ...]
 
@@ -102,19 +102,20 @@ def load_record(directory: Path | str, *, limits: ReadingLimits | None = None) -
     content = current_task(run["task"], record_format=run.get("format", 1))
     task = validate(Task, content, source=f"{argument}: task")
     # The goal is the record's own copy, wherever the record lies now.
-    task = task.model_copy(update={"target": directory / TARGET_FILE})
+    own = goal_file(directory)
+    task = task.model_copy(update={"goal": own})
     limits = limits or _limits(task)
     with boundary(argument, expected="the files of a run record"):
         expected = "the goal of a run record"
-        with open_arrays(directory / TARGET_FILE, argument=f"{argument}: {TARGET_FILE}", expected=expected, limits=limits) as file:
-            target = torch.from_numpy(file.read("position", shape=("M", 3), kinds="f", meaning="positions"))
+        with open_arrays(own, argument=f"{argument}: {own.name}", expected=expected, limits=limits) as file:
+            goal = torch.from_numpy(file.read("position", shape=("M", 3), kinds="f", meaning="positions"))
         scene = task.scene
-        sizes = {"N": scene.particle_count, "M": len(scene.manipulators), "A": scene.action_size}
+        sizes = {"N": scene.particle_count, "M": len(scene.tools), "A": scene.action_size}
         stages = tuple(
             read_stage(path, argument=f"{argument}: {path.name}", sizes=sizes, limits=limits) for path in stage_files(directory)
         )
         metrics = tuple(read_json_lines(directory / METRICS_FILE, argument=f"{argument}: {METRICS_FILE}", limits=limits))
-    return RunRecord(directory, run, task, target, metrics, stages)
+    return RunRecord(directory, run, task, goal, metrics, stages)
 
 
 def _limits(task: Task) -> ReadingLimits:

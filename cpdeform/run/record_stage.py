@@ -18,6 +18,7 @@ from cpdeform.core.reading.json_text import parse_json
 from cpdeform.core.reading.limits import ReadingLimits
 from cpdeform.core.state import State
 from cpdeform.planning.result import StageResult, Status
+from cpdeform.run.migration import array_name
 from cpdeform.run.record_files import replacing_hdf5, to_json, write_dataset
 
 MARGIN = 1e-3
@@ -30,7 +31,7 @@ STATE_FIELDS = {
     "velocity": ("world, particle, xyz", "length/second"),
     "affine": ("world, particle, row, column", "1/second"),
     "elastic_strain": ("world, particle, xx yy zz xy xz yz", "1"),
-    "manipulator_pose": ("world, tool, xyz wxyz gap", POSE_UNITS),
+    "tool_pose": ("world, tool, xyz wxyz gap", POSE_UNITS),
 }
 
 
@@ -58,12 +59,10 @@ def write_stage(path: Path, result: StageResult) -> None:
         )
         if result.candidates:
             _write_candidates(file.create_group("placements"), result.candidates)
-        if result.actions is not None and result.positions is not None and result.manipulator_poses is not None:
+        if result.actions is not None and result.positions is not None and result.tool_poses is not None:
             write_dataset(file, "actions", result.actions, shape="step, action", units="1, in [-1, 1]")
             write_dataset(file, "positions", result.positions.float(), shape="time (step + 1), particle, xyz", units=LENGTH)
-            write_dataset(
-                file, "manipulator_poses", result.manipulator_poses, shape="time (step + 1), tool, xyz wxyz gap", units=POSE_UNITS
-            )
+            write_dataset(file, "tool_poses", result.tool_poses, shape="time (step + 1), tool, xyz wxyz gap", units=POSE_UNITS)
 
 
 def _write_candidates(group: h5py.Group, candidates: tuple[Candidate, ...]) -> None:
@@ -103,7 +102,7 @@ def read_stage(
     with open_arrays(path, argument=argument, expected="a stage of a run record", limits=limits, sizes=sizes) as file:
         state_before, state = _read_state(file, "state_before"), _read_state(file, "state")
         candidates = _read_candidates(file) if "placements" in file else ()
-        best = read_attribute(file, "best", int)
+        best, poses = read_attribute(file, "best", int), array_name(file, "tool_poses")
         result = StageResult(
             index=read_attribute(file, "index", int),
             status=Status(read_attribute(file, "status", str)),
@@ -114,7 +113,7 @@ def read_stage(
             best=None if best < 0 else best,
             actions=_tensor(file, "actions", ("T", "A")) if "actions" in file else None,
             positions=_positions(file, "positions", ("T + 1", "N", 3)) if "positions" in file else None,
-            manipulator_poses=_tensor(file, "manipulator_poses", ("T + 1", "M", 8)) if "manipulator_poses" in file else None,
+            tool_poses=_tensor(file, poses, ("T + 1", "M", 8)) if poses in file else None,
             loss_before=read_attribute(file, "loss_before", float),
             loss=read_attribute(file, "loss", float),
             gradient_evaluations=read_attribute(file, "gradient_evaluations", int),
@@ -145,7 +144,7 @@ def _read_state(file: ArrayFile, name: str) -> State:
         velocity=_tensor(file, f"{name}/velocity", (1, "N", 3)),
         affine=_tensor(file, f"{name}/affine", (1, "N", 3, 3)),
         elastic_strain=_tensor(file, f"{name}/elastic_strain", (1, "N", 6)),
-        manipulator_pose=_tensor(file, f"{name}/manipulator_pose", (1, "M", 8)),
+        tool_pose=_tensor(file, array_name(file, f"{name}/tool_pose"), (1, "M", 8)),
     )
 
 
@@ -180,11 +179,9 @@ def _check_stage(stage: StageResult, argument: str) -> None:
         raise InputError(argument, came=came, expected="numbers of at least 0")
     if stage.best is not None and stage.best >= len(stage.candidates):
         raise InputError(f"{argument}: best", came=str(stage.best), expected=f"one of {len(stage.candidates)} candidates")
-    plan = (stage.actions, stage.positions, stage.manipulator_poses)
+    plan = (stage.actions, stage.positions, stage.tool_poses)
     if stage.status.executed and any(part is None for part in plan):
-        raise InputError(
-            argument, came="a finished stage without a plan", expected="actions, positions, manipulator_poses and best"
-        )
+        raise InputError(argument, came="a finished stage without a plan", expected="actions, positions, tool_poses and best")
     if stage.actions is not None and stage.positions is not None and len(stage.positions) != len(stage.actions) + 1:
         came = f"{len(stage.positions)} times for {len(stage.actions)} steps"
         raise InputError(f"{argument}: positions", came=came, expected="one time more than steps")

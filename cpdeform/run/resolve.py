@@ -13,6 +13,7 @@ from typing import Any
 from cpdeform.core.errors import InputError
 from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.objective import Objective
+from cpdeform.core.old_names import current_options
 from cpdeform.core.ot import OTSolver
 from cpdeform.core.placer import Placer
 from cpdeform.core.plugins import AUTO, Registry
@@ -198,7 +199,7 @@ def resolve(
         PluginError: Nothing is installed that ``"auto"`` could stand for.
     """
     objects = objects or PartObjects()
-    values = given.model_dump(exclude_unset=True) if isinstance(given, RunConfiguration) else dict(given)
+    values = given.model_dump(exclude_unset=True) if isinstance(given, RunConfiguration) else current_options(dict(given))
     asked = validate(RunConfiguration, values, source="configuration")
     if record is not None:
         if task is not None or "task" in values:
@@ -270,7 +271,7 @@ def _changed(task: Task, configuration: RunConfiguration) -> Task:
     return changed_task(
         task,
         scene=configuration.scene,
-        target=configuration.target,
+        goal=configuration.goal,
         step_count=configuration.steps,
         rest_steps=configuration.rest_steps,
     )

@@ -100,9 +100,9 @@ def check_same_task(record: RunRecord, asked: Task) -> None:
     ]
     given = next((task for task in tasks if task["scene"] == recorded["scene"]), tasks[0])
     different = [field for field in ("scene", "step_count", "rest_steps", "metric") if given[field] != recorded[field]]
-    goal = torch.as_tensor((asked if changes.target is None else record.task).load_target()).to(record.target)
-    if goal.shape != record.target.shape or not torch.allclose(goal, record.target, atol=1e-6):
-        different.append("target")
+    goal = torch.as_tensor((asked if changes.goal is None else record.task).load_goal()).to(record.goal)
+    if goal.shape != record.goal.shape or not torch.allclose(goal, record.goal, atol=1e-6):
+        different.append("goal")
     if different:
         came = f'"{asked.name}" with another {", ".join(different)}'
         raise InputError("TASK", came=came, expected=f"the task as it is in run record {record.directory}", remedy=remedy)

@@ -82,7 +82,7 @@ def evaluate_shape(
     *,
     start: State | None = None,
     final: State,
-    target: Tensor,
+    goal: Tensor,
     from_rest: bool = True,
     backend: str = AUTO,
     registry: Registry | None = None,
@@ -93,7 +93,7 @@ def evaluate_shape(
         scene: The scene.
         start: What the result began from, a single world; defaults to the scene's start.
         final: The result, a single world.
-        target: Goal particles (M, 3), length units.
+        goal: Goal particles (M, 3), length units.
         from_rest: Whether to let all three come to rest first.
         backend: Registered name of the simulator that they rest in; ``"auto"`` is the fastest that is installed for the CPU.
         registry: Where the name is looked up; defaults to the installed plugins.
@@ -104,7 +104,7 @@ def evaluate_shape(
     """
     began = time.perf_counter()
     start = start or initial_state(scene)
-    goal, clouds = target.detach().cpu().double(), [state.position[0].detach().cpu() for state in (start, final)]
+    goal, clouds = goal.detach().cpu().double(), [state.position[0].detach().cpu() for state in (start, final)]
     data: dict[str, Any] = {}
     if from_rest:
         registry = registry or load_registry()
@@ -134,7 +134,7 @@ def evaluate_shape_record(record: RunRecord, **options: Any) -> ShapeEvaluation:
         InputError: No stage of the run is complete.
         PluginError: There is no simulator to rest in.
     """
-    return evaluate_shape(record.task.scene, final=record.state, target=record.target, **options)
+    return evaluate_shape(record.task.scene, final=record.state, goal=record.goal, **options)
 
 
 def _resolved(registry: Registry, backend: str) -> str:

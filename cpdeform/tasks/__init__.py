@@ -1,1 +1,1 @@
-"""Tasks as data files, and the makers of their targets."""
+"""Tasks as data files, and the makers of their goals."""

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from cpdeform.core.bounded import MOST_PARTICLES
 from cpdeform.core.errors import InputError, UnknownNameError
+from cpdeform.core.goal import POSITION_SCALE, dense_grid, write_goal
 from cpdeform.core.plugins import Registry, load_registry
 from cpdeform.core.reading.arrays import MOST_NUMBER, NUMBERS, ArrayFile, open_arrays
 from cpdeform.core.reading.limits import ReadingLimits
 from cpdeform.core.scene import Scene
-from cpdeform.core.target import POSITION_SCALE, dense_grid, write_target
 from cpdeform.core.task import Task, load_task
 from cpdeform.planning.objectives.mass import mass_grid
 
@@ -189,7 +189,7 @@ def import_grid(
     if path is not None:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_target(path, stored, grid=scaled)
+            write_goal(path, stored, grid=scaled)
         except OSError as problem:
             came = f"a path that cannot be written ({problem.strerror or problem})"
             raise InputError(f"goal file {path}", came=came, expected="a writable path") from problem

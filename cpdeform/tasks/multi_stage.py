@@ -42,7 +42,7 @@ def _solid(make: Callable[[], Solid]) -> Maker:
 
 def _letters(scene: Scene, simulator: Callable[[], Simulator]) -> Array:
     letters = {"left": 0.215, "top": 0.422, "width": 0.12, "height": 0.156, "gap": 0.07}
-    legs = write("ICLR", **letters, pen_height=0.161, depth=0.035, scale=scene.manipulators[0].action_scale[0])
+    legs = write("ICLR", **letters, pen_height=0.161, depth=0.035, scale=scene.tools[0].action_scale[0])
     return perform(legs, simulator())
 
 

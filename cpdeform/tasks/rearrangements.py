@@ -1,4 +1,4 @@
-"""Targets that are the body's own particles, put elsewhere: cubes moved about, a rope bent."""
+"""Goals that are the body's own particles, put elsewhere: cubes moved about, a rope bent."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Targets made by scripted tool motions through a simulator.
+"""Goals made by scripted tool motions through a simulator.
 
-A motion starts from the scene's own particles, so a target's particles are the body's, moved.
+A motion starts from the scene's own particles, so a goal's particles are the body's, moved.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Leg:
     def action_rows(self, scene: Scene) -> torch.Tensor:
         """Actions (T, A) of all tools; components that are not given are zero."""
         row: list[float] = []
-        for index, manipulator in enumerate(scene.manipulators):
+        for index, tool in enumerate(scene.tools):
             given = list(self.actions.get(index, ()))
-            row += given + [0.0] * (manipulator.action_size - len(given))
+            row += given + [0.0] * (tool.action_size - len(given))
         return torch.tensor(row, dtype=torch.float64).expand(self.steps, -1)
 
 
@@ -65,7 +65,7 @@ def _placed(state: State, leg: Leg) -> State:
     """The state with the leg's tools at their starts."""
     if not leg.start:
         return state
-    poses = state.manipulator_pose.clone()
+    poses = state.tool_pose.clone()
     for index, position in leg.start.items():
         poses[0, index, :3] = torch.tensor(position, dtype=poses.dtype)
-    return state.with_manipulators(poses)
+    return state.with_tools(poses)

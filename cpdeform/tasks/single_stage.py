@@ -21,7 +21,7 @@ EPISODE = 50
 
 def _velocity(scene: Scene, tool: int, way: Vector3, steps: int) -> tuple[float, float, float]:
     """The action that takes a tool along a way, length units, in a number of steps."""
-    x, y, z = (part / steps / scale for part, scale in zip(way, scene.manipulators[tool].action_scale[:3], strict=True))
+    x, y, z = (part / steps / scale for part, scale in zip(way, scene.tools[tool].action_scale[:3], strict=True))
     return x, y, z
 
 
@@ -30,7 +30,7 @@ def _carried(scene: Scene, squeeze: float, ways: Sequence[Vector3], *, steps: in
     pairs = [((2 * number, 1.0), (2 * number + 1, -1.0)) for number in range(len(ways))]
     # In the scenes whose first tool is the right one of a pair the signs are the other way round.
     signs = [
-        (tool, sign if scene.manipulators[pair[0][0]].position[0] < scene.manipulators[pair[1][0]].position[0] else -sign)
+        (tool, sign if scene.tools[pair[0][0]].position[0] < scene.tools[pair[1][0]].position[0] else -sign)
         for pair in pairs
         for tool, sign in pair
     ]
@@ -68,7 +68,7 @@ def _chopsticks(scene: Scene, way: Vector3, turn: float) -> list[Leg]:
     """Closed round the rod, then carried; `turn` about the vertical in radians."""
     grip = Leg(8, {0: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.25)})
     steps = EPISODE - grip.steps
-    about = turn / steps / scene.manipulators[0].action_scale[4]
+    about = turn / steps / scene.tools[0].action_scale[4]
     return [grip, Leg(steps, {0: (*_velocity(scene, 0, way, steps), 0.0, about, 0.0, 0.0)})]
 
 
@@ -83,7 +83,7 @@ def _assembly(scene: Scene, way: Vector3) -> list[Leg]:
 def _table(scene: Scene, way: Vector3) -> list[Leg]:
     """A leg is pushed outwards, slowly."""
     x, _, z = way
-    scale = scene.manipulators[0].action_scale
+    scale = scene.tools[0].action_scale
     return [Leg(40, {0: (x / 40 / scale[0], 0.0, z / 40 / scale[2])}), Leg(10)]
 
 

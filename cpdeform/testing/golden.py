@@ -97,18 +97,18 @@ def compare_golden(
 
 def _pose_error(golden: Golden, trajectory: Trajectory) -> float:
     expected = recorded_poses(golden.scene, golden.arrays["prim"])
-    found = trajectory.manipulator_poses[0].double().cpu()
+    found = trajectory.tool_poses[0].double().cpu()
     return float((found - expected).abs().max()) if expected.numel() else 0.0
 
 
 def _gradient_errors(golden: Golden, simulator: Simulator, trajectory: Trajectory) -> dict[str, Any]:
     recorded = torch.as_tensor(golden.arrays["grad"]) if "grad" in golden.arrays else torch.empty(0)
     usable = torch.isfinite(recorded) & (recorded.abs() < OVERFLOW)
-    if golden.target_grid is None or not bool(usable.any()):
+    if golden.goal_grid is None or not bool(usable.any()):
         return {}
-    objective = ObjectivePlasticineLab(golden.scene, golden.target_grid.to(device=simulator.device, dtype=simulator.dtype))
+    objective = ObjectivePlasticineLab(golden.scene, golden.goal_grid.to(device=simulator.device, dtype=simulator.dtype))
     result = objective.evaluate(trajectory)
-    gradient = simulator.vjp(trajectory, result.grad_positions, result.grad_manipulators).actions[0].double().cpu()
+    gradient = simulator.vjp(trajectory, result.grad_positions, result.grad_tools).actions[0].double().cpu()
     found, expected = gradient[usable], recorded[usable]
     total = float(golden.arrays["total_loss"])
     return {
@@ -137,13 +137,13 @@ def check_golden_file(
     factory: SimulatorFactory,
     *,
     scenes: Path | None = None,
-    targets: Path | None = None,
+    goals: Path | None = None,
     device: torch.device | str = "cpu",
     dtype: torch.dtype | None = None,
 ) -> GoldenErrors:
     """Read a golden file and compare; see `read_golden` and `compare_golden`. Whatever is raised is a failure of this file."""
     try:
-        return compare_golden(read_golden(path, scenes=scenes, targets=targets), factory, device=device, dtype=dtype)
+        return compare_golden(read_golden(path, scenes=scenes, goals=goals), factory, device=device, dtype=dtype)
     except CapabilityError as error:
         return GoldenErrors(path.stem, "unsupported", reason=str(error))
     except CpdeformError as error:

@@ -3,7 +3,7 @@
 A file holds x0, v0, F0, C0 (start), prim (tool states), actions, x, v (end), and total_loss and grad of PlasticineLab's objective
 (nan where not recorded). Those recorded from PlasticineLab are named by the scene in its spelling and a version
 (``torus-v2-seed0.npz``), and scenes and target grids are files of their own. Those that `cpdeform.testing.record_oracle` makes hold
-the scene (as JSON) and target_grid (G, G, G), too, and have any name.
+the scene (as JSON) and goal_grid (G, G, G), too, and have any name.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from torch import Tensor
 
 from cpdeform.core.bounded import MOST_STEPS
 from cpdeform.core.errors import CapabilityError, InputError, brief
+from cpdeform.core.goal import dense_grid
 from cpdeform.core.reading.arrays import NUMBERS, ArrayFile, open_arrays
 from cpdeform.core.reading.json_text import parse_json, read_json
 from cpdeform.core.reading.limits import ReadingLimits
 from cpdeform.core.reading.models import field_error
 from cpdeform.core.scene import Scene
 from cpdeform.core.state import State, elastic_strain_from_gradient
-from cpdeform.core.target import dense_grid
 
 NAME_PATTERN = re.compile(r"(?P<scene>.+?)-(?P<version>v\d+)(?:[-.].*)?$")
 SCENES: Mapping[str, tuple[str, str]] = {
@@ -53,6 +53,9 @@ SCENES: Mapping[str, tuple[str, str]] = {
 }
 """PlasticineLab's name of a scene to the name of its definition and, before the version, of its target grid."""
 
+GRID_NAMES = ("goal_grid", "target_grid")
+"""The goal's node masses in this project's own files: their name, and that of earlier versions."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Golden:
@@ -63,14 +66,14 @@ class Golden:
         scene: Its scene.
         state: Its start, float64, a single world.
         arrays: All recorded arrays of numbers.
-        target_grid: Node masses (G, G, G) of the target, float64; None where none is at hand.
+        goal_grid: Node masses (G, G, G) of the goal, float64; None where none is at hand.
     """
 
     name: str
     scene: Scene
     state: State
     arrays: dict[str, NDArray[np.float64]]
-    target_grid: Tensor | None
+    goal_grid: Tensor | None
 
     @property
     def actions(self) -> Tensor:
@@ -91,19 +94,19 @@ def golden_files(directory: Path) -> list[Path]:
 
 
 def read_golden(
-    path: Path, *, scenes: Path | None = None, targets: Path | None = None, limits: ReadingLimits | None = None
+    path: Path, *, scenes: Path | None = None, goals: Path | None = None, limits: ReadingLimits | None = None
 ) -> Golden:
     """Read a golden file.
 
     Args:
         path: The file.
         scenes: JSON file of scene definitions; defaults to ``plasticinelab/scenes.json`` beside the file's folder.
-        targets: Target grids; defaults to ``plasticinelab/target_grids.npz`` beside the file's folder, if it exists.
+        goals: Target grids; defaults to ``plasticinelab/target_grids.npz`` beside the file's folder, if it exists.
         limits: How large the file may be; defaults to `cpdeform.core.reading.limits.default_limits`.
 
     Raises:
         InputError: A file is missing or too large, or its content does not fit.
-        CapabilityError: The scene holds a manipulator that this version does not know.
+        CapabilityError: The scene holds a tool that this version does not know.
     """
     with open_arrays(path, argument=str(path), expected="a golden file", limits=limits) as file:
         if "scene" in file:
@@ -111,14 +114,15 @@ def read_golden(
             scene = _scene(f"{path}: scene", _own_definition(path, text), file)
             arrays = _read_arrays(file, scene)
             shape = (scene.grid_size,) * 3
-            grid = torch.as_tensor(file.read("target_grid", shape=shape)) if "target_grid" in file else None
+            name = next((name for name in GRID_NAMES if name in file), None)
+            grid = None if name is None else torch.as_tensor(file.read(name, shape=shape))
         else:
             scene_name, grid_name = _names(path)
             beside = Path(os.path.realpath(path)).parent.parent / "plasticinelab"
             definition = _definition(scenes or beside / "scenes.json", scene_name)
             scene = _scene(f"{scenes or beside / 'scenes.json'}: {scene_name}", definition, file)
             arrays = _read_arrays(file, scene)
-            grid = _target_grid(targets, beside / "target_grids.npz", grid_name, scene)
+            grid = _goal_grid(goals, beside / "target_grids.npz", grid_name, scene)
     return Golden(path.stem, scene, recorded_start(scene, arrays), arrays, grid)
 
 
@@ -156,14 +160,14 @@ def _scene(source: str, fields: dict[str, Any], file: ArrayFile) -> Scene:
         return Scene.model_validate(fields)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        if first["type"] == "union_tag_invalid" and first["loc"][0] == "manipulators":
-            raise CapabilityError(brief(f"this version has no such manipulator: {first['msg']}", 300)) from error
+        if first["type"] == "union_tag_invalid" and first["loc"][0] == "tools":
+            raise CapabilityError(brief(f"this version has no such tool: {first['msg']}", 300)) from error
         raise field_error(Scene, error, source=source) from error
 
 
 def _read_arrays(file: ArrayFile, scene: Scene) -> dict[str, NDArray[np.float64]]:
     """All arrays of numbers; those that are used have the scene's shapes."""
-    count, tools = scene.particle_count, sum(8 if hasattr(tool, "gap") else 7 for tool in scene.manipulators)
+    count, tools = scene.particle_count, sum(8 if hasattr(tool, "gap") else 7 for tool in scene.tools)
     shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys(("x0", "v0", "x", "v"), (count, 3))
     shapes |= {"F0": (count, 3, 3), "C0": (count, 3, 3)}
     shapes |= {"actions": ("T", scene.action_size), "prim": ("T + 1", tools)}
@@ -189,9 +193,9 @@ def _read_arrays(file: ArrayFile, scene: Scene) -> dict[str, NDArray[np.float64]
 
 def recorded_poses(scene: Scene, recorded: NDArray[np.float64]) -> Tensor:
     """Tool poses (T+1, M, 8), float64, of recorded ones (T+1, numbers): 7 numbers a tool, 8 for one with a gap."""
-    poses = torch.zeros(recorded.shape[0], len(scene.manipulators), 8, dtype=torch.float64)
+    poses = torch.zeros(recorded.shape[0], len(scene.tools), 8, dtype=torch.float64)
     first = 0
-    for index, tool in enumerate(scene.manipulators):
+    for index, tool in enumerate(scene.tools):
         width = 8 if hasattr(tool, "gap") else 7
         poses[:, index, :width] = torch.as_tensor(recorded[:, first : first + width])
         first += width
@@ -208,7 +212,7 @@ def recorded_start(scene: Scene, arrays: dict[str, NDArray[np.float64]]) -> Stat
     return State(position, velocity, affine, strain, poses)
 
 
-def _target_grid(given: Path | None, beside: Path, name: str, scene: Scene) -> Tensor | None:
+def _goal_grid(given: Path | None, beside: Path, name: str, scene: Scene) -> Tensor | None:
     if given is None and not beside.is_file():
         return None
     path = given or beside

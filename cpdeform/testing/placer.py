@@ -48,7 +48,7 @@ class PlacerBench:
 
 
 def _is_current(placement: Proposal, stage: Stage) -> bool:
-    pose = stage.state.manipulator_pose[0]
+    pose = stage.state.tool_pose[0]
     return placement.pose.shape == pose.shape and torch.allclose(placement.pose.to(pose), pose, atol=1e-7)
 
 
@@ -73,18 +73,18 @@ def make_stage(placer: Placer | None = None, *, dtype: torch.dtype = torch.float
     }
     posts = [{"kind": "Sphere", "radius": 0.03, "position": (0.2, 0.1, z)} for z in (0.4, 0.6)]
     tools = [posts[0], ball, posts[1]] if fixed else [ball]
-    scene = Scene.model_validate({"bodies": [body], "manipulators": tools, "grid_size": 32})
+    scene = Scene.model_validate({"bodies": [body], "tools": tools, "grid_size": 32})
     state = initial_state(scene, dtype=dtype)
     distance = (state.position[0] - torch.tensor(PEAK).to(state.position)).norm(dim=1)
     priorities = 0.02 * torch.exp(-((distance / 0.03) ** 2))
     priorities = priorities - priorities.median()
-    target = state.position[0] - torch.tensor([0.0, 0.01, 0.0]).to(state.position)
+    goal = state.position[0] - torch.tensor([0.0, 0.01, 0.0]).to(state.position)
     problem = None if placer is None else placer.transport_problem
     displacements = None
     if problem is not None and problem.exponent == DISPLACEMENT_EXPONENT:
         displacements = priorities.clamp(min=0.0)[:, None] * torch.tensor([0.0, -1.0, 0.0]).to(priorities)
     transport = transport_of(priorities, displacements)
-    return Stage(0, scene, state, target, transport, torch.Generator().manual_seed(0))
+    return Stage(0, scene, state, goal, transport, torch.Generator().manual_seed(0))
 
 
 def transport_of(priorities: Tensor, displacements: Tensor | None = None) -> OTResult:
@@ -110,7 +110,7 @@ def _gap(placement: Proposal, stage: Stage) -> float:
     """Least distance between a tool and a particle, negative inside."""
     points = stage.state.position[0].double()
     poses = placement.pose.double()
-    return min(float(signed_distance(tool, poses[index], points).min()) for index, tool in enumerate(stage.scene.manipulators))
+    return min(float(signed_distance(tool, poses[index], points).min()) for index, tool in enumerate(stage.scene.tools))
 
 
 def check_found(bench: PlacerBench) -> Finding:
@@ -121,7 +121,7 @@ def check_found(bench: PlacerBench) -> Finding:
 def check_shapes(bench: PlacerBench) -> Finding:
     """Poses have shape (M, 8), are finite, and their quaternions have length 1; scores and labels have their types."""
     complaints = []
-    particles, tools = bench.stage.scene.bodies[0].particle_count, len(bench.stage.scene.manipulators)
+    particles, tools = bench.stage.scene.bodies[0].particle_count, len(bench.stage.scene.tools)
     for item in bench.placements:
         if tuple(item.pose.shape) != (tools, 8) or not bool(torch.isfinite(item.pose).all()):
             complaints.append(f"pose has shape {tuple(item.pose.shape)} instead of {(tools, 8)}, or is not finite")
@@ -151,7 +151,7 @@ def check_bounds(bench: PlacerBench) -> Finding:
     outside = [0.0]
     for seed in range(2):
         for item in bench.make().ask(reseeded(bench.stage, seed)):
-            for index, tool in enumerate(bench.stage.scene.manipulators):
+            for index, tool in enumerate(bench.stage.scene.tools):
                 position = item.pose[index, :3].double().cpu()
                 lower, upper = (torch.tensor(bound, dtype=torch.float64) for bound in (tool.lower_bound, tool.upper_bound))
                 outside.append(float(torch.maximum(lower - position, position - upper).max()))
@@ -161,9 +161,9 @@ def check_bounds(bench: PlacerBench) -> Finding:
 def check_fixed_tools(bench: PlacerBench) -> Finding:
     """Tools that no action moves stay where they are."""
     stage = make_stage(bench.make(), fixed=True)
-    current, moved = stage.state.manipulator_pose[0], [0.0]
+    current, moved = stage.state.tool_pose[0], [0.0]
     for item in bench.make().ask(stage):
-        for index, tool in enumerate(stage.scene.manipulators):
+        for index, tool in enumerate(stage.scene.tools):
             if not tool.movable:
                 moved.append(float((item.pose[index].to(current) - current[index]).abs().max()))
     return Finding(max(moved), 1e-6)
@@ -186,7 +186,7 @@ def check_reproducible(bench: PlacerBench) -> Finding:
 
 
 def check_stage_untouched(bench: PlacerBench) -> Finding:
-    """State, target and priorities are as they were."""
+    """State, goal and priorities are as they were."""
     stage = make_stage(bench.make())
     kept = [tensor.clone() for tensor in _tensors(stage)]
     bench.make().ask(stage)
@@ -195,7 +195,7 @@ def check_stage_untouched(bench: PlacerBench) -> Finding:
 
 
 def _tensors(stage: Stage) -> tuple[Tensor, ...]:
-    return (stage.state.position, stage.state.manipulator_pose, stage.target, stage.priorities)
+    return (stage.state.position, stage.state.tool_pose, stage.goal, stage.priorities)
 
 
 def check_impossible(bench: PlacerBench) -> Finding:
@@ -240,7 +240,7 @@ PLACER_CHECKS: tuple[CheckItem[PlacerBench], ...] = (
         "no collision with the body", check_collision, "Test candidates with cpdeform.core.signed_distance against all particles."
     ),
     CheckItem("tools within their bounds", check_bounds, "Keep each position between the tool's lower_bound and upper_bound."),
-    CheckItem("fixed tools stay", check_fixed_tools, "Start from stage.state.manipulator_pose and change movable tools only."),
+    CheckItem("fixed tools stay", check_fixed_tools, "Start from stage.state.tool_pose and change movable tools only."),
     CheckItem("reproducible by the generator", check_reproducible, "Draw from stage.generator only; keep no state between stages."),
     CheckItem("stage is not modified", check_stage_untouched, "Clone tensors of the stage before writing to them."),
     CheckItem(

@@ -26,7 +26,7 @@ from cpdeform.planning.objectives.plasticinelab import ObjectivePlasticineLab, m
 from cpdeform.testing.golden_file import recorded_start
 from cpdeform.testing.simulator_bench import SimulatorFactory
 
-TARGET_OFFSET = (0.04, -0.01, 0.03)
+GOAL_OFFSET = (0.04, -0.01, 0.03)
 """The goal that the recorded loss belongs to is the start, moved by this, length units."""
 
 
@@ -69,7 +69,7 @@ RECORDINGS: Mapping[str, Recording] = MappingProxyType(
                         "material": {"youngs_modulus": 3000.0, "poisson_ratio": 0.3, "yield_stress": 15.0},
                     },
                 ],
-                "manipulators": [
+                "tools": [
                     {
                         "kind": "Capsule",
                         "position": (0.45, 0.18, 0.52),
@@ -107,7 +107,7 @@ RECORDINGS: Mapping[str, Recording] = MappingProxyType(
             scene={
                 **_COMMON,
                 "bodies": [{"kind": "box", "position": (0.5, 0.07, 0.5), "widths": (0.2, 0.12, 0.14), "particle_count": 180}],
-                "manipulators": [
+                "tools": [
                     {
                         "kind": "RollingPin",
                         "position": (0.43, 0.15, 0.5),
@@ -166,29 +166,29 @@ def record(recording: Recording, factory: SimulatorFactory) -> dict[str, NDArray
         "C0": recording.affine * generator.standard_normal((count, 3, 3)),
         "F0": np.eye(3) + recording.strain * generator.standard_normal((count, 3, 3)),
         "actions": generator.uniform(-1.0, 1.0, (recording.steps, scene.action_size)),
-        "prim": _numbers(scene, start.manipulator_pose),
+        "prim": _numbers(scene, start.tool_pose),
     }
     simulator = factory(scene, batch_size=1, device="cpu", dtype=torch.float64)
     actions = torch.as_tensor(arrays["actions"]).unsqueeze(0)
     trajectory = simulator.rollout(recorded_start(scene, arrays), actions)
-    grid = mass_grid(start.position[0] + torch.tensor(TARGET_OFFSET, dtype=torch.float64), scene)
+    grid = mass_grid(start.position[0] + torch.tensor(GOAL_OFFSET, dtype=torch.float64), scene)
     result = ObjectivePlasticineLab(scene, grid).evaluate(trajectory)
-    gradient = simulator.vjp(trajectory, result.grad_positions, result.grad_manipulators)
+    gradient = simulator.vjp(trajectory, result.grad_positions, result.grad_tools)
     return {
         **arrays,
-        "prim": _numbers(scene, trajectory.manipulator_poses[0]),
+        "prim": _numbers(scene, trajectory.tool_poses[0]),
         "x": trajectory.final_state.position[0].numpy(),
         "v": trajectory.final_state.velocity[0].numpy(),
         "grad": gradient.actions[0].numpy(),
         "total_loss": result.loss[0].numpy(),
-        "target_grid": grid.numpy(),
+        "goal_grid": grid.numpy(),
         "scene": np.array(scene.model_dump_json()),
     }
 
 
 def _numbers(scene: Scene, poses: Tensor) -> NDArray[np.float64]:
     """Tool poses (T, M, 8) as golden files hold them: 7 numbers a tool, 8 for one with a gap."""
-    parts = [poses[:, index, : 8 if hasattr(tool, "gap") else 7] for index, tool in enumerate(scene.manipulators)]
+    parts = [poses[:, index, : 8 if hasattr(tool, "gap") else 7] for index, tool in enumerate(scene.tools)]
     return np.asarray(torch.cat(parts, dim=1).numpy())
 
 

@@ -53,7 +53,7 @@ def check_simulator(
         if not isinstance(first, Simulator):
             raise TypeError(f"it is a {type(first).__name__}, not a cpdeform.core.simulator.Simulator")
         capabilities = first.capabilities
-        bench = SimulatorBench(factory, capabilities, torch.device(device), scene or default_scene(capabilities.manipulator_kinds))
+        bench = SimulatorBench(factory, capabilities, torch.device(device), scene or default_scene(capabilities.tool_kinds))
     except Exception as error:
         advice = f"factory(scene, batch_size=1, device=..., dtype=None) raised {type(error).__name__}: {error}"
         return Report(name, (Check("it can be built", "failed", advice=advice),))

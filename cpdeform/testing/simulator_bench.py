@@ -54,7 +54,7 @@ def example_tool(kind: str, **changes: Any) -> dict[str, Any]:
         Skip: There is no example of this kind.
     """
     if kind not in EXAMPLES:
-        raise Skip(f"There is no example of a manipulator of kind {kind}; pass a scene that holds one.")
+        raise Skip(f"There is no example of a tool of kind {kind}; pass a scene that holds one.")
     return {"kind": kind, "action_scale": ALL_MOTIONS, "rotation_wxyz": TILTED, **EXAMPLES[kind], **changes}
 
 
@@ -65,7 +65,7 @@ def resting(*tools: dict[str, Any], **changes: Any) -> Scene:
         Skip: This version of the scene does not know a tool.
     """
     body = {"kind": "box", "position": (0.5, 0.06, 0.5), "widths": (0.12, 0.1, 0.12), "particle_count": 300}
-    content = {"bodies": [body], "manipulators": tools, "grid_size": 32, "substeps": 5, **changes}
+    content = {"bodies": [body], "tools": tools, "grid_size": 32, "substeps": 5, **changes}
     try:
         return Scene.model_validate(content)
     except ValidationError as error:

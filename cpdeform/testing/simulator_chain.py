@@ -19,11 +19,11 @@ INPUTS = {
     "velocity": "velocity",
     "affine": "velocity",
     "elastic_strain": "elastic_strain",
-    "manipulator_pose": "actions",
+    "tool_pose": "actions",
 }
 """Tensors of the final state, and the input by which its gradient is compared with central differences; the chain compares all."""
 
-SIZES = {"position": 1.0, "velocity": 1e-2, "affine": 1e-3, "elastic_strain": 1.0, "manipulator_pose": 1.0}
+SIZES = {"position": 1.0, "velocity": 1e-2, "affine": 1e-3, "elastic_strain": 1.0, "tool_pose": 1.0}
 """Weights of the final state's tensors, so that each counts in their sum."""
 
 
@@ -75,7 +75,7 @@ def check_chain(bench: SimulatorBench) -> Finding:
             state = parts[-1].final_state
         outputs = {
             "positions": torch.cat([parts[0].positions, *(part.positions[:, 1:] for part in parts[1:])], dim=1),
-            "manipulator_poses": torch.cat([part.manipulator_poses[:, 1:] for part in parts], dim=1),
+            "tool_poses": torch.cat([part.tool_poses[:, 1:] for part in parts], dim=1),
             **{name: SIZES[name] * getattr(state, name) for name in names},
         }
         generator = torch.Generator().manual_seed(6)

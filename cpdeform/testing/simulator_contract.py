@@ -35,8 +35,8 @@ def check_shapes(bench: SimulatorBench) -> Finding:
     simulator = bench.make(bench.scene, batch_size=2)
     state, actions = stirred(simulator, batch_size=2), random_actions(simulator, batch_size=2, steps=3)
     trajectory = simulator.rollout(state, actions)
-    particles, tools = bench.scene.particle_count, len(bench.scene.manipulators)
-    expected = {"positions": (2, 4, particles, 3), "manipulator_poses": (2, 4, tools, 8), "actions": tuple(actions.shape)}
+    particles, tools = bench.scene.particle_count, len(bench.scene.tools)
+    expected = {"positions": (2, 4, particles, 3), "tool_poses": (2, 4, tools, 8), "actions": tuple(actions.shape)}
     complaints = []
     for name, shape in expected.items():
         tensor = getattr(trajectory, name)
@@ -71,10 +71,10 @@ def _end_complaints(trajectory: Trajectory, state: State) -> list[str]:
     pairs = {
         "positions[:, 0] is not the start": (trajectory.positions[:, 0], state.position),
         "positions[:, -1] is not final_state.position": (trajectory.positions[:, -1], trajectory.final_state.position),
-        "manipulator_poses[:, 0] is not the start": (trajectory.manipulator_poses[:, 0], state.manipulator_pose),
-        "manipulator_poses[:, -1] is not final_state's": (
-            trajectory.manipulator_poses[:, -1],
-            trajectory.final_state.manipulator_pose,
+        "tool_poses[:, 0] is not the start": (trajectory.tool_poses[:, 0], state.tool_pose),
+        "tool_poses[:, -1] is not final_state's": (
+            trajectory.tool_poses[:, -1],
+            trajectory.final_state.tool_pose,
         ),
         "initial_state is not the start": (trajectory.initial_state.position, state.position),
     }
@@ -131,7 +131,7 @@ def _stage_result(start: State, trajectory: Trajectory) -> StageResult:
         best=None,
         actions=trajectory.actions[0],
         positions=trajectory.positions[0],
-        manipulator_poses=trajectory.manipulator_poses[0],
+        tool_poses=trajectory.tool_poses[0],
         loss_before=0.0,
         loss=0.0,
         gradient_evaluations=0,
@@ -149,7 +149,7 @@ def check_halves(bench: SimulatorBench) -> Finding:
     second = simulator.rollout(first.final_state, actions[:, 2:])
     figures = (
         largest_difference(second.positions, whole.positions[:, 2:]),
-        largest_difference(second.manipulator_poses, whole.manipulator_poses[:, 2:]),
+        largest_difference(second.tool_poses, whole.tool_poses[:, 2:]),
         1e-2 * largest_difference(second.final_state.elastic_strain, whole.final_state.elastic_strain),
     )
     return Finding(max(figures), bench.bound(1e-10, 1e-5))
@@ -162,7 +162,7 @@ def check_batch(bench: SimulatorBench) -> Finding:
     together = simulator.rollout(state, actions)
     alone = [simulator.rollout(state.select(world), actions[world : world + 1]) for world in range(3)]
     figures = []
-    for name in ("positions", "manipulator_poses"):
+    for name in ("positions", "tool_poses"):
         figures += [largest_difference(getattr(one, name)[0], getattr(together, name)[world]) for world, one in enumerate(alone)]
     return Finding(max(figures), bench.bound(1e-10, 1e-5))
 
@@ -212,7 +212,7 @@ def _memory_complaints(bench: SimulatorBench) -> list[str]:
 
 def _undeclared_kinds(bench: SimulatorBench) -> list[str]:
     complaints = []
-    for kind in set(EXAMPLES) - set(bench.capabilities.manipulator_kinds):
+    for kind in set(EXAMPLES) - set(bench.capabilities.tool_kinds):
         try:
             scene = resting(example_tool(kind))
         except Skip:
@@ -222,17 +222,17 @@ def _undeclared_kinds(bench: SimulatorBench) -> list[str]:
 
 
 def check_kinds(bench: SimulatorBench) -> Finding:
-    """Each declared kind of manipulator runs, and pushes the clay that it is pressed into."""
-    if not bench.capabilities.manipulator_kinds:
-        raise Skip("It declares no kind of manipulator.")
+    """Each declared kind of tool runs, and pushes the clay that it is pressed into."""
+    if not bench.capabilities.tool_kinds:
+        raise Skip("It declares no kind of tool.")
     complaints = []
-    for kind in bench.capabilities.manipulator_kinds:
+    for kind in bench.capabilities.tool_kinds:
         simulator = bench.make(resting(example_tool(kind)))
         state, actions = simulator.initial_state(), random_actions(simulator)
         trajectory = simulator.rollout(state, actions)
-        if not bool(torch.isfinite(trajectory.positions).all() & torch.isfinite(trajectory.manipulator_poses).all()):
+        if not bool(torch.isfinite(trajectory.positions).all() & torch.isfinite(trajectory.tool_poses).all()):
             complaints.append(f"{kind}: not finite")
-        if torch.equal(trajectory.manipulator_poses[:, 0], trajectory.manipulator_poses[:, -1]):
+        if torch.equal(trajectory.tool_poses[:, 0], trajectory.tool_poses[:, -1]):
             complaints.append(f"{kind}: the tool does not move")
         still = simulator.rollout(state, torch.zeros_like(actions))
         if largest_difference(still.positions, trajectory.positions) < 1e-7:
@@ -242,12 +242,12 @@ def check_kinds(bench: SimulatorBench) -> Finding:
 
 def check_errors(bench: SimulatorBench) -> Finding:
     """Inputs that do not fit raise `InputError` with the argument's name."""
-    simulator = bench.make(default_scene(bench.capabilities.manipulator_kinds[:1]))
+    simulator = bench.make(default_scene(bench.capabilities.tool_kinds[:1]))
     state, actions = simulator.initial_state(), random_actions(simulator)
     wide = torch.cat([actions, actions[..., :1]], dim=-1)
     fewer = State(**{field.name: getattr(state, field.name)[:, :-1] for field in dataclasses.fields(State)})
-    fewer = dataclasses.replace(fewer, manipulator_pose=state.manipulator_pose)
-    more = dataclasses.replace(state, manipulator_pose=torch.cat([state.manipulator_pose, torch.zeros(1, 1, 8).to(actions)], dim=1))
+    fewer = dataclasses.replace(fewer, tool_pose=state.tool_pose)
+    more = dataclasses.replace(state, tool_pose=torch.cat([state.tool_pose, torch.zeros(1, 1, 8).to(actions)], dim=1))
     cases = {
         "an action component too many": (lambda: simulator.rollout(state, wide), ["actions"]),
         "actions without an axis of worlds": (lambda: simulator.rollout(state, actions[0]), ["actions"]),
@@ -255,7 +255,7 @@ def check_errors(bench: SimulatorBench) -> Finding:
         "actions of two worlds, state of one": (lambda: simulator.rollout(state, actions.expand(2, -1, -1)), ["actions", "state"]),
         "more worlds than batch_size": (lambda: simulator.rollout(state.fork(2), actions.expand(2, -1, -1)), ["batch_size"]),
         "a particle too few": (lambda: simulator.rollout(fewer, actions), ["state", "position"]),
-        "a tool too many": (lambda: simulator.rollout(more, actions), ["state", "manipulator"]),
+        "a tool too many": (lambda: simulator.rollout(more, actions), ["state", "tool"]),
         "batch_size 0": (lambda: bench.make(bench.scene, batch_size=0), ["batch_size"]),
     }
     if bench.capabilities.differentiable:
@@ -269,16 +269,16 @@ def check_errors(bench: SimulatorBench) -> Finding:
 
 def check_values_refused(bench: SimulatorBench) -> Finding:
     """Numbers that are not finite or make no sense raise `InputError` with the name of the tensor."""
-    simulator = bench.make(default_scene(bench.capabilities.manipulator_kinds[:1]))
+    simulator = bench.make(default_scene(bench.capabilities.tool_kinds[:1]))
     state, actions = simulator.initial_state(), no_actions(simulator)
     cases = {f"nan in {name}": _spoilt(state, name, torch.nan) for name in ("position", "velocity", "affine", "elastic_strain")}
     cases |= {"an infinite velocity": _spoilt(state, "velocity", torch.inf), "a position of 1e6": _spoilt(state, "position", 1e6)}
     complaints = []
-    if len(simulator.scene.manipulators):
-        nothing = dataclasses.replace(state, manipulator_pose=state.manipulator_pose.clone())
-        nothing.manipulator_pose[..., 3:7] = 0.0
-        cases |= {"nan in a quaternion": _spoilt(state, "manipulator_pose", torch.nan, 5), "a quaternion of zeros": nothing}
-        cases |= {"a tool at 1e6": _spoilt(state, "manipulator_pose", 1e6, 1)}
+    if len(simulator.scene.tools):
+        nothing = dataclasses.replace(state, tool_pose=state.tool_pose.clone())
+        nothing.tool_pose[..., 3:7] = 0.0
+        cases |= {"nan in a quaternion": _spoilt(state, "tool_pose", torch.nan, 5), "a quaternion of zeros": nothing}
+        cases |= {"a tool at 1e6": _spoilt(state, "tool_pose", 1e6, 1)}
     for what, start in cases.items():
         call: Callable[[], object] = lambda start=start: simulator.rollout(start, actions)  # type: ignore[misc]  # noqa: E731
         complaints += complaint_unless_raised(call, InputError, words=["state."], what=what)
@@ -319,7 +319,7 @@ CONTRACT_CHECKS: tuple[CheckItem[SimulatorBench], ...] = (
     CheckItem(
         "deterministic where declared", check_determinism, "Order the sums, or take the device out of deterministic_devices."
     ),
-    CheckItem("declared manipulator kinds run", check_kinds, "Implement the kind, or take it out of manipulator_kinds."),
+    CheckItem("declared tool kinds run", check_kinds, "Implement the kind, or take it out of tool_kinds."),
     CheckItem(
         "capabilities hold",
         check_capabilities,

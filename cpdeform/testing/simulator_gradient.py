@@ -32,7 +32,7 @@ STEPS = {
     "velocity": (1e-6, 1e-2),
     "affine": (1e-5, 1e-1),
     "elastic_strain": (1e-8, 1e-4),
-    "manipulator_pose": (1e-8, 1e-5),
+    "tool_pose": (1e-8, 1e-5),
 }
 """Step of the differences in double and single precision, in the unit of each input."""
 
@@ -61,7 +61,7 @@ class Probe:
 
     def outputs(self, trajectory: Trajectory) -> tuple[Tensor, ...]:
         """What the loss is about."""
-        return trajectory.positions, trajectory.manipulator_poses
+        return trajectory.positions, trajectory.tool_poses
 
     def pull_back(self, trajectory: Trajectory) -> RolloutGradient:
         """Gradient of the loss."""
@@ -89,12 +89,12 @@ class Probe:
 
     def _allowed(self, name: str, direction: Tensor) -> Tensor:
         """Remove what no backend is asked for: a change of a quaternion's length, and of a gap that a tool does not have."""
-        if name != "manipulator_pose":
+        if name != "tool_pose":
             return direction
         direction = direction.clone()
-        rotation = self.state.manipulator_pose[..., 3:7]
+        rotation = self.state.tool_pose[..., 3:7]
         direction[..., 3:7] -= (direction[..., 3:7] * rotation).sum(dim=-1, keepdim=True) * rotation
-        for index, tool in enumerate(self.simulator.scene.manipulators):
+        for index, tool in enumerate(self.simulator.scene.tools):
             if tool.kind != "Chopsticks":  # type: ignore[comparison-overlap,unused-ignore]  # older scenes have no such tool
                 direction[:, index, 7] = 0.0
         return direction
@@ -118,21 +118,21 @@ class Probe:
 def check_gradient(bench: SimulatorBench, *, name: str) -> Finding:
     """Gradient of one input of a rollout."""
     bench.require_gradient()
-    if name in ("actions", "manipulator_pose") and not bench.scene.action_size:
+    if name in ("actions", "tool_pose") and not bench.scene.action_size:
         raise Skip("The scene has no tool that moves.")
     return Finding(Probe(bench, bench.scene).error(name), bench.bound(DOUBLE_BOUND, SINGLE_BOUND))
 
 
 def check_kind_gradients(bench: SimulatorBench) -> Finding:
-    """Gradients through the contact with every declared kind of manipulator."""
+    """Gradients through the contact with every declared kind of tool."""
     bench.require_gradient()
     figures = {}
-    for kind in bench.capabilities.manipulator_kinds:
+    for kind in bench.capabilities.tool_kinds:
         probe = Probe(bench, resting(example_tool(kind)))
-        for name in ("actions", "manipulator_pose", "position"):
+        for name in ("actions", "tool_pose", "position"):
             figures[f"{name} with {kind}"] = probe.error(name)
     if not figures:
-        raise Skip("It declares no kind of manipulator.")
+        raise Skip("It declares no kind of tool.")
     return worst(figures, bench.bound(DOUBLE_BOUND, SINGLE_BOUND))
 
 
@@ -161,7 +161,7 @@ def check_gradients_from_rest(bench: SimulatorBench) -> Finding:
     """Gradients are finite where nothing moves: no velocity, no strain, no action; with and without touching."""
     bench.require_gradient()
     complaints = []
-    kinds = bench.capabilities.manipulator_kinds
+    kinds = bench.capabilities.tool_kinds
     for kind in kinds:
         for height in (None, 0.45):
             tool = example_tool(kind)
@@ -169,12 +169,10 @@ def check_gradients_from_rest(bench: SimulatorBench) -> Finding:
             scene = resting({**tool, "position": (x, y if height is None else height, z)}, gravity_parameter=(0.0, 0.0, 0.0))
             simulator = bench.make(scene)
             trajectory = simulator.rollout(simulator.initial_state(), no_actions(simulator))
-            gradient = simulator.vjp(
-                trajectory, torch.ones_like(trajectory.positions), torch.ones_like(trajectory.manipulator_poses)
-            )
+            gradient = simulator.vjp(trajectory, torch.ones_like(trajectory.positions), torch.ones_like(trajectory.tool_poses))
             complaints += [f"{name}: {kind}" for name in _not_finite(gradient)]
     if not kinds:
-        raise Skip("It declares no kind of manipulator.")
+        raise Skip("It declares no kind of tool.")
     return violations(complaints)
 
 
@@ -201,7 +199,7 @@ _DIFFERENCES = (
 
 GRADIENT_CHECKS: tuple[CheckItem[SimulatorBench], ...] = (
     *(CheckItem(f"gradient of {name}", functools.partial(check_gradient, name=name), _DIFFERENCES) for name in STEPS),
-    CheckItem("gradient with each manipulator kind", check_kind_gradients, _DIFFERENCES),
+    CheckItem("gradient with each tool kind", check_kind_gradients, _DIFFERENCES),
     CheckItem("gradient of a batch is a loop over worlds", check_batch_gradients, "Worlds mix on the way back."),
     CheckItem(
         "gradient is finite from rest",

@@ -18,7 +18,7 @@ def _turn_state(state: State) -> None:
     """Write to every tensor of a state. Particles change places, so that grids that were kept still hold them."""
     for field in dataclasses.fields(State):
         tensor = getattr(state, field.name)
-        tensor.copy_(tensor.flip(1) + (0.01 if field.name == "manipulator_pose" else 0.0))
+        tensor.copy_(tensor.flip(1) + (0.01 if field.name == "tool_pose" else 0.0))
 
 
 def _turn(tensor: Tensor) -> None:
@@ -29,7 +29,7 @@ WRITES: dict[str, Callable[[State, Tensor, Trajectory], None]] = {
     "the given state": lambda state, actions, trajectory: _turn_state(state),
     "the given actions": lambda state, actions, trajectory: _turn(actions),
     "Trajectory.positions": lambda state, actions, trajectory: _turn(trajectory.positions),
-    "Trajectory.manipulator_poses": lambda state, actions, trajectory: _turn(trajectory.manipulator_poses),
+    "Trajectory.tool_poses": lambda state, actions, trajectory: _turn(trajectory.tool_poses),
     "Trajectory.actions": lambda state, actions, trajectory: _turn(trajectory.actions),
     "Trajectory.initial_state": lambda state, actions, trajectory: _turn_state(trajectory.initial_state),
     "Trajectory.final_state": lambda state, actions, trajectory: _turn_state(trajectory.final_state),

@@ -102,7 +102,7 @@ def check_symmetry(bench: SimulatorBench) -> Finding:
         state.velocity[..., swap],
         state.affine[..., swap, :][..., swap],
         state.elastic_strain[..., strain_swap],
-        state.manipulator_pose,
+        state.tool_pose,
     )
     shift = torch.tensor([2.0, -3.0, 1.0]).to(state.position) * simulator.scene.node_distance
     moved = dataclasses.replace(state, position=state.position + shift)
@@ -158,12 +158,12 @@ def _squeezing_scene(kinds: tuple[str, ...]) -> Scene:
         if kind in kinds:
             tool = example_tool(kind, action_scale=(0.02, 0.02, 0.02))
             return resting(tool, grid_size=64, substeps=19, gravity_parameter=(0.0, 0.0, 0.0))
-    raise Skip("It declares no kind of manipulator that could squeeze.")
+    raise Skip("It declares no kind of tool that could squeeze.")
 
 
 def check_squeeze(bench: SimulatorBench) -> Finding:
     """A tool pressed into the clay pushes it down, and the clay's volume stays within a few percent."""
-    simulator = bench.make(_squeezing_scene(bench.capabilities.manipulator_kinds))
+    simulator = bench.make(_squeezing_scene(bench.capabilities.tool_kinds))
     actions = no_actions(simulator, steps=4)
     actions[..., 1] = -0.5
     state = simulator.initial_state()

@@ -36,7 +36,7 @@ TOOLS: dict[str, dict[str, Any]] = {
     "Torus": {"major_radius": 0.04, "tube_radius": 0.02, "position": (0.503, 0.123, 0.498)},
 }
 
-STEPS = {"position": 1e-8, "velocity": 1e-6, "affine": 1e-5, "elastic_strain": 1e-8, "manipulator_pose": 1e-8}
+STEPS = {"position": 1e-8, "velocity": 1e-6, "affine": 1e-5, "elastic_strain": 1e-8, "tool_pose": 1e-8}
 """Step of the finite differences for each tensor of the state."""
 
 
@@ -66,7 +66,7 @@ def tool(kind: str, **changes: Any) -> dict[str, Any]:
 
 def scene(*tools: dict[str, Any], **changes: Any) -> Scene:
     body = {"kind": "box", "position": (0.5, 0.06, 0.5), "widths": (0.12, 0.1, 0.12), "particle_count": 300}
-    return Scene.model_validate({"bodies": [body], "manipulators": tools, "grid_size": 32, "substeps": 5, **changes})
+    return Scene.model_validate({"bodies": [body], "tools": tools, "grid_size": 32, "substeps": 5, **changes})
 
 
 def floating(**changes: Any) -> Scene:

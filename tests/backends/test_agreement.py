@@ -38,7 +38,7 @@ def number(low: float, high: float) -> st.SearchStrategy[float]:
 
 
 @st.composite
-def manipulators(draw: st.DrawFn) -> dict[str, Any]:
+def tools(draw: st.DrawFn) -> dict[str, Any]:
     """A tool in or near the top of the clay, of any rotation."""
     kind = draw(st.sampled_from(sorted(LENGTHS)))
     turn = [draw(number(-1.0, 1.0)) for _ in range(3)]
@@ -75,7 +75,7 @@ def scenes(draw: st.DrawFn) -> Scene:
     return Scene.model_validate(
         {
             "bodies": bodies,
-            "manipulators": [draw(manipulators()) for _ in range(draw(st.integers(1, 2)))],
+            "tools": [draw(tools()) for _ in range(draw(st.integers(1, 2)))],
             "grid_size": 32,
             "substeps": 3,
             "ground_friction": draw(st.sampled_from([0.0, 0.5, 1.5, 100.0])),
@@ -97,7 +97,7 @@ def follow(simulator: Simulator, seed: int) -> tuple[Tensor, Tensor]:
     gradient = simulator.vjp(trajectory, weights)
     start = gradient.initial_state
     # each part of length 1: the gradients differ by orders of magnitude
-    parts = (gradient.actions, start.position, start.velocity, start.elastic_strain, start.manipulator_pose)
+    parts = (gradient.actions, start.position, start.velocity, start.elastic_strain, start.tool_pose)
     flat = [part.double().flatten() for part in parts]
     return trajectory.positions[:, -1].double(), torch.cat([part / part.norm().clamp_min(SMALLEST_GRADIENT) for part in flat])
 

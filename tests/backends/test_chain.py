@@ -57,16 +57,16 @@ def test_a_final_gradient_of_zeros_changes_nothing_and_another_shape_is_named(si
         assert torch.equal(getattr(found.initial_state, name), getattr(expected.initial_state, name)), name
     with pytest.raises(InputError, match=r"grad_final_state.position: got shape \(1, 300, 3\), expected shape \(2, 300, 3\)"):
         simulator.vjp(trajectory, weights, grad_final_state=zeros.select(0))
-    with pytest.raises(InputError, match="grad_manipulators"):
-        simulator.vjp(trajectory, weights, trajectory.manipulator_poses[:, 1:])
+    with pytest.raises(InputError, match="grad_tools"):
+        simulator.vjp(trajectory, weights, trajectory.tool_poses[:, 1:])
 
 
 def test_what_vjp_is_given_stays_as_it_is(simulator: Simulator) -> None:
     trajectory = simulator.rollout(stirred(simulator, batch_size=2), actions_for(simulator, batch_size=2))
-    given = trajectory.positions.clone(), trajectory.manipulator_poses.clone(), trajectory.final_state.clone()
+    given = trajectory.positions.clone(), trajectory.tool_poses.clone(), trajectory.final_state.clone()
     simulator.vjp(trajectory, given[0], given[1], grad_final_state=given[2])
     assert torch.equal(given[0], trajectory.positions)
-    assert torch.equal(given[1], trajectory.manipulator_poses)
+    assert torch.equal(given[1], trajectory.tool_poses)
     for name in FIELDS:
         assert torch.equal(getattr(given[2], name), getattr(trajectory.final_state, name)), name
 
@@ -75,8 +75,8 @@ def old_backend() -> Simulator:
     """A backend whose `vjp` was written before it was given the gradient of the final state."""
 
     class SimulatorOld(backend_class("warp")):
-        def vjp(self, trajectory, grad_positions, grad_manipulators=None):
-            return super().vjp(trajectory, grad_positions, grad_manipulators)
+        def vjp(self, trajectory, grad_positions, grad_tools=None):
+            return super().vjp(trajectory, grad_positions, grad_tools)
 
     return SimulatorOld(CASES["two tools"], dtype=torch.float64)
 
@@ -89,9 +89,9 @@ def test_an_old_backend_serves_for_losses_on_positions_and_tools() -> None:
         trajectory = differentiable_rollout(simulator, stirred(simulator), actions)
         at = trajectory.final_state if end else State(
             trajectory.positions[:, -1], *(getattr(trajectory.final_state, name) for name in FIELDS[1:-1]),
-            trajectory.manipulator_poses[:, -1],
+            trajectory.tool_poses[:, -1],
         )  # fmt: skip
-        (at.position.square().sum() + at.manipulator_pose.square().sum()).backward()
+        (at.position.square().sum() + at.tool_pose.square().sum()).backward()
         gradients.append(actions.grad)
     assert torch.allclose(*gradients, rtol=1e-12)
     assert gradients[0].abs().max() > 0.0

@@ -80,7 +80,7 @@ def test_a_trajectory_goes_with_the_last_reference_to_it(backend: str, use: Call
     actions = torch.zeros(1, 1, 3, dtype=simulator.dtype, requires_grad=True)
     trajectory = differentiable_rollout(simulator, simulator.initial_state(), actions)
     use(trajectory)
-    watched = {name: weakref.ref(getattr(trajectory, name)) for name in ("positions", "manipulator_poses")}
+    watched = {name: weakref.ref(getattr(trajectory, name)) for name in ("positions", "tool_poses")}
     watched["graph"] = weakref.ref(trajectory.positions.grad_fn)
     del trajectory
     assert [name for name, reference in watched.items() if reference() is not None] == []

@@ -15,7 +15,7 @@ from backend_cases import BACKENDS, backend_class
 from cpdeform.core.errors import MissingExtraError
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.scene import Scene
-from cpdeform.core.shapes.kinds import MANIPULATORS
+from cpdeform.core.shapes.kinds import TOOLS
 from cpdeform.core.simulator import Simulator
 from cpdeform.testing import GoldenErrors, check_golden_file, compare_golden, read_golden
 from cpdeform.testing.golden_file import golden_files
@@ -74,8 +74,8 @@ def test_the_files_are_those_of_the_recorder_and_small() -> None:
 
 
 def test_all_kinds_of_tools_and_motions_are_recorded() -> None:
-    tools = [tool for name in NAMES for tool in read_golden(path(name)).scene.manipulators]
-    assert {tool.kind for tool in tools} == set(MANIPULATORS)
+    tools = [tool for name in NAMES for tool in read_golden(path(name)).scene.tools]
+    assert {tool.kind for tool in tools} == set(TOOLS)
     assert {tool.action_size for tool in tools} == {0, 3, 6, 7}
     for name in NAMES:
         assert read_golden(path(name)).arrays["grad"].all()
@@ -85,10 +85,10 @@ def test_all_kinds_of_tools_and_motions_are_recorded() -> None:
 def test_every_tool_leaves_its_mark(name: str) -> None:
     golden = read_golden(path(name))
     simulator = backend_class("warp")(golden.scene, dtype=torch.float64)
-    for index in range(len(golden.scene.manipulators)):
-        pose = golden.state.manipulator_pose.clone()
+    for index in range(len(golden.scene.tools)):
+        pose = golden.state.tool_pose.clone()
         pose[:, index, 1] += 0.4
-        end = simulator.rollout(golden.state.with_manipulators(pose), golden.actions).positions[0, -1].numpy()
+        end = simulator.rollout(golden.state.with_tools(pose), golden.actions).positions[0, -1].numpy()
         assert np.abs(end - golden.arrays["x"]).max() > 1e-4
 
 
@@ -112,7 +112,7 @@ def test_a_simulator_with_another_physics_is_caught(change: dict[str, float]) ->
     def factory(scene: Scene, **options: Any) -> Simulator:
         content = scene.model_dump()
         name = next(iter(change))
-        holder = {"friction": content["manipulators"][1], "yield_stress": content["material"], "poisson_ratio": content["material"]}
+        holder = {"friction": content["tools"][1], "yield_stress": content["material"], "poisson_ratio": content["material"]}
         holder.get(name, content).update(change)
         return warp(Scene.model_validate(content), **options)
 
@@ -137,7 +137,7 @@ def test_recording_a_simulator_gives_what_it_is_held_against() -> None:
     """Warp, recorded, is equal to the file in everything that is not computed, and close in the rest."""
     found, golden = record(RECORDINGS["press"], backend_class("warp")), read_golden(path("press"))
     assert json.loads(str(found["scene"])) == json.loads(golden.scene.model_dump_json())
-    for name in ("x0", "v0", "C0", "F0", "actions", "target_grid"):
+    for name in ("x0", "v0", "C0", "F0", "actions", "goal_grid"):
         np.testing.assert_allclose(found[name], golden.arrays[name], rtol=0.0, atol=1e-15)
     for name in ("x", "prim", "grad", "total_loss"):
         np.testing.assert_allclose(found[name], golden.arrays[name], rtol=1e-4, atol=1e-9)

@@ -31,7 +31,7 @@ def act_again(state: State, actions: Tensor, trajectory: Trajectory) -> None:
 
 def centre(state: State, actions: Tensor, trajectory: Trajectory) -> None:
     """What somebody does who draws the result."""
-    for tensor in (trajectory.positions, trajectory.manipulator_poses, trajectory.actions, trajectory.initial_state.position):
+    for tensor in (trajectory.positions, trajectory.tool_poses, trajectory.actions, trajectory.initial_state.position):
         tensor.sub_(tensor.mean(dim=-2, keepdim=True))
     trajectory.final_state.map(Tensor.zero_)
 

@@ -35,12 +35,12 @@ def test_gradients_equal_central_differences(backend: Backend, name: str) -> Non
     def noise(like: Tensor) -> Tensor:
         return torch.randn(like.shape, generator=generator, dtype=torch.float64)
 
-    weights, pose_weights = noise(trajectory.positions), noise(trajectory.manipulator_poses)
+    weights, pose_weights = noise(trajectory.positions), noise(trajectory.tool_poses)
     gradient = simulator.vjp(trajectory, weights, pose_weights)
 
     def loss(start: State, plan: Tensor) -> float:
         result = simulator.rollout(start, plan)
-        return float((result.positions * weights).sum() + (result.manipulator_poses * pose_weights).sum())
+        return float((result.positions * weights).sum() + (result.tool_poses * pose_weights).sum())
 
     def compare(expected: float, found: Tensor, direction: Tensor, name: str) -> None:
         scale = float(found.norm() * direction.norm()) / math.sqrt(direction.numel())
@@ -65,7 +65,7 @@ def test_gradients_are_finite_from_rest_and_without_contact(backend: Backend) ->
         gradient = simulator.vjp(trajectory, torch.ones_like(trajectory.positions))
         assert torch.isfinite(gradient.actions).all()
         assert torch.equal(gradient.actions, torch.zeros_like(gradient.actions))
-        for name in ("position", "velocity", "affine", "elastic_strain", "manipulator_pose"):
+        for name in ("position", "velocity", "affine", "elastic_strain", "tool_pose"):
             assert torch.isfinite(getattr(gradient.initial_state, name)).all(), name
 
 
@@ -126,7 +126,7 @@ def test_physics_does_not_depend_on_the_axis(backend: Backend) -> None:
         state.velocity[..., swap],
         state.affine[..., swap, :][..., swap],
         state.elastic_strain[..., strain_swap],
-        state.manipulator_pose,
+        state.tool_pose,
     )
     plain = simulator.rollout(state, torch.zeros(1, 2, 0)).final_state
     other = simulator.rollout(swapped, torch.zeros(1, 2, 0)).final_state
@@ -154,7 +154,7 @@ def test_pressed_clay_gives_way_and_keeps_out_of_the_tool(backend: Backend) -> N
     pressing = torch.zeros(1, 4, 3)
     pressing[..., 1] = -0.5
     trajectory = simulator.rollout(simulator.initial_state(), pressing)
-    centre = trajectory.manipulator_poses[0, -1, 0, :3]
+    centre = trajectory.tool_poses[0, -1, 0, :3]
     distance = (trajectory.positions[0, -1] - centre).norm(dim=-1)
     below = trajectory.positions[0, 0, :, 1].max()
     assert centre[1] - 0.03 < below - 0.02  # it went 2 cm deep
@@ -170,7 +170,7 @@ def test_rollout_of_both_halves_is_the_whole(backend: Backend, memory_budget: in
     second = simulator.rollout(first.final_state, actions[:, 2:])
     assert torch.equal(second.final_state.position, whole.final_state.position)
     assert torch.equal(second.final_state.elastic_strain, whole.final_state.elastic_strain)
-    assert torch.equal(second.manipulator_poses, whole.manipulator_poses[:, 2:])
+    assert torch.equal(second.tool_poses, whole.tool_poses[:, 2:])
 
 
 def test_recomputed_and_kept_substeps_give_the_same_gradient(backend: Backend) -> None:
@@ -218,7 +218,7 @@ def test_tools_move_as_told(backend: Backend) -> None:
         dtype=torch.float64,
     )
     actions = torch.tensor([[1.0, -0.5, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0]]).expand(3, -1).unsqueeze(0)
-    first, second = simulator.rollout(simulator.initial_state(), actions).manipulator_poses[0, -1]
+    first, second = simulator.rollout(simulator.initial_state(), actions).tool_poses[0, -1]
     assert torch.allclose(first[:3], torch.tensor([0.36, 0.47, 0.5], dtype=torch.float64), atol=1e-12)
     half = 0.5 * 3 * 0.5
     assert torch.allclose(first[3:7], torch.tensor([math.cos(half), 0.0, 0.0, math.sin(half)], dtype=torch.float64), atol=1e-12)

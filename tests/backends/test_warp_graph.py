@@ -84,7 +84,7 @@ def slotted(case: str, capture: Any = tape_capture, **options: Any) -> Simulator
 
 def gradients_for(trajectory: Trajectory, seed: int = 3) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(seed)
-    tensors = (trajectory.positions, trajectory.manipulator_poses)
+    tensors = (trajectory.positions, trajectory.tool_poses)
     return tuple(torch.randn(tensor.shape, generator=generator, dtype=torch.float64).to(tensor) for tensor in tensors)  # type: ignore[return-value]
 
 
@@ -95,8 +95,8 @@ def inputs(simulator: SimulatorWarp, *, worlds: int = 2, steps: int = 2, seed: i
 
 def tensors_of(made: Trajectory | RolloutGradient) -> list[Tensor]:
     state = made.final_state if isinstance(made, Trajectory) else made.initial_state
-    found = [state.position, state.velocity, state.affine, state.elastic_strain, state.manipulator_pose]
-    return [*found, *((made.positions, made.manipulator_poses) if isinstance(made, Trajectory) else (made.actions,))]
+    found = [state.position, state.velocity, state.affine, state.elastic_strain, state.tool_pose]
+    return [*found, *((made.positions, made.tool_poses) if isinstance(made, Trajectory) else (made.actions,))]
 
 
 def assert_equal(made: Trajectory | RolloutGradient, expected: Trajectory | RolloutGradient) -> None:

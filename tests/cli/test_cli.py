@@ -120,7 +120,7 @@ def test_runs_without_result(directory, options, status):
         (["--set", "scene.grid_sise=32"], ['Did you mean "grid_size"']),
         (["--set", "scene.bodies.3.radius=1"], ["bodies.3"]),
         (["--set", "scene.bodies.0.particle_count=0"], ["particle_count: got 0"]),
-        (["--set", "scene.manipulators.0.position=[0.4,0.53,0.4]"], ["scene.manipulators.0", "deep inside the body"]),
+        (["--set", "scene.tools.0.position=[0.4,0.53,0.4]"], ["scene.tools.0", "deep inside the body"]),
         (["--out", "shift.yaml"], ["output directory shift.yaml", "a file"]),
         (["--out", "."], ["not empty", "--overwrite"]),
         (["--out", "shift.yaml/run"], ["cannot be written"]),
@@ -147,16 +147,16 @@ def test_unusable_options(directory, arguments, messages):
         ("writer-v99", ["variant of task writer", "v99"]),
         ("binary.yaml", ["binary.yaml"]),
         ("empty.yaml", ["empty.yaml"]),
-        ("no_target.yaml", ["no such file", "target"]),
-        ("bad_target.yaml", ["unreadable"]),
+        ("no_goal.yaml", ["no such file", "goal"]),
+        ("bad_goal.yaml", ["unreadable"]),
     ],
 )
 def test_unusable_tasks(directory, task, messages):
     text = (directory / "shift.yaml").read_text()
     (directory / "binary.yaml").write_bytes(b"\xff\x00\xfe")
     (directory / "empty.yaml").write_text("")
-    (directory / "no_target.yaml").write_text(text.replace("target.npz", "absent.npz"))
-    (directory / "bad_target.yaml").write_text(text.replace("target.npz", "shift.yaml"))
+    (directory / "no_goal.yaml").write_text(text.replace("goal.npz", "absent.npz"))
+    (directory / "bad_goal.yaml").write_text(text.replace("goal.npz", "shift.yaml"))
     before = files(directory)
     result = invoke("run", task, *PARTS)
     assert result.exit_code == 2, result.output

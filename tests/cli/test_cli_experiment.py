@@ -66,7 +66,7 @@ def test_interruption_leaves_the_table_and_the_next_call_goes_on(directory, monk
         (["--seeds", "-1"], ["--seeds: got -1"]),
         (["--iterations", "0"], ["--iterations: got 0"]),
         (["--particles", "0"], ["--particles: got 0"]),
-        (["--targets", "nowhere"], ["--targets: got nowhere", "a directory"]),
+        (["--goals", "nowhere"], ["--goals: got nowhere", "a directory"]),
         (["--backend", "tyo"], ['simulator: got "tyo"', 'Did you mean "toy"']),
         (["--ot", "tyo"], ['ot_solver: got "tyo"']),
         (["--device", "gpu"], ['--device: got "gpu"']),

@@ -100,8 +100,8 @@ def test_links_in_the_directory_are_not_followed(inside, toy_task_file):
     out.mkdir()
     victim = inside.parent / "victim"
     victim.write_text("mine")
-    names = ["run.json", "metrics.jsonl", "target.h5", "stage-000.h5"]
-    names += [".run.tmp.json", ".target.tmp.h5", ".stage-000.tmp.h5", ".run.lock"]
+    names = ["run.json", "metrics.jsonl", "goal.h5", "stage-000.h5"]
+    names += [".run.tmp.json", ".goal.tmp.h5", ".stage-000.tmp.h5", ".run.lock"]
     for number, name in enumerate(names):
         (out / name).symlink_to(victim if number % 2 else inside.parent / "fresh")
     before = outside(inside)

@@ -23,7 +23,7 @@ from cpdeform.run.record import load_record
 PARTS = ["--backend", "toy", "--ot", "toy", "--placer", "toy", "--iterations", "3"]
 BOARD = {
     "bodies": [{"kind": "box", "position": [0.5, 0.08, 0.5], "widths": [0.2, 0.16, 0.2], "particle_count": 500}],
-    "manipulators": [{"kind": "Sphere", "radius": 0.06, "position": [0.5, 0.221, 0.5], "action_scale": [0.005, 0.005, 0.005]}],
+    "tools": [{"kind": "Sphere", "radius": 0.06, "position": [0.5, 0.221, 0.5], "action_scale": [0.005, 0.005, 0.005]}],
     "grid_size": 32,
     "gravity_parameter": [0.0, 0.0, 0.0],
     "substeps": 5,
@@ -98,11 +98,11 @@ def test_stages_that_were_left(directory):
 
 def test_task_and_goal_are_the_records(directory, half):
     (directory / "shift.yaml").unlink()
-    (directory / "target.npz").unlink()
+    (directory / "goal.npz").unlink()
     assert resume("--set", "scene.ground_friction=3").exit_code == 0
     record = load_record("rest")
     assert record.task.scene.ground_friction == 3.0
-    assert torch.equal(record.target, load_record("half").target)
+    assert torch.equal(record.goal, load_record("half").goal)
     shutil.rmtree(half)
     assert invoke("run", "--resume", "rest", "--out", "more").exit_code == 0
     assert load_record("more").task.scene == record.task.scene
@@ -149,7 +149,7 @@ def test_pictures_of_a_resumed_run(half):
     ("arguments", "messages"),
     [
         (["writer"], ['TASK: got "writer-v1"', '"shift"', "Leave TASK out"]),
-        (["changed.yaml"], ['"shift" with another scene, step_count, target', "half"]),
+        (["changed.yaml"], ['"shift" with another scene, step_count, goal', "half"]),
         (["--set", "task=writer"], ['TASK: got "writer-v1"']),
         (["--set", "scene.bodies.0.particle_count=30"], ["state: got 60 particles, expected 30 particles"]),
         (["--set", "scene.grid_sise=32"], ['Did you mean "grid_size"']),
@@ -162,9 +162,9 @@ def test_pictures_of_a_resumed_run(half):
 )
 def test_unusable_options(directory, half, arguments, messages):
     task = yaml.safe_load((directory / "shift.yaml").read_text())
-    task["scene"]["grid_size"], task["step_count"], task["target"] = 32, 7, "other.npz"
+    task["scene"]["grid_size"], task["step_count"], task["goal"] = 32, 7, "other.npz"
     (directory / "changed.yaml").write_text(yaml.safe_dump(task))
-    np.savez(directory / "other.npz", position=load_record("half").target + 0.01)
+    np.savez(directory / "other.npz", position=load_record("half").goal + 0.01)
     shutil.copytree(half, directory / "empty")
     (directory / "empty" / "stage-000.h5").unlink()
     finished = resume(*arguments)
@@ -186,8 +186,8 @@ def test_runs_go_on_on_another_backend(first, second, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     simulator = SimulatorWarp(Scene.model_validate(BOARD))
     pressing = torch.tensor([0.0, -1.0, 0.0]).expand(1, 8, 3)
-    np.savez("target.npz", position=simulator.rollout(simulator.initial_state(), pressing).positions[0, -1])
-    content = {"name": "board", "scene": BOARD, "target": "target.npz", "step_count": 4, "stage_count": 2}
+    np.savez("goal.npz", position=simulator.rollout(simulator.initial_state(), pressing).positions[0, -1])
+    content = {"name": "board", "scene": BOARD, "goal": "goal.npz", "step_count": 4, "stage_count": 2}
     (tmp_path / "board.yaml").write_text(yaml.safe_dump(content))
     options = ["--placer", "fixed", "--iterations", "2", "--set", "objective.points=100", "--set", "optimizer.learning_rate=0.3"]
     for backend, stages, out in ((second, 2, "whole"), (first, 1, "half")):
@@ -202,6 +202,6 @@ def test_runs_go_on_on_another_backend(first, second, tmp_path, monkeypatch):
     # the same numbers but for rounding: one of the halves may have been computed in single precision
     exact = first == second
     assert found["position"] <= (0.0 if exact else 1e-5), found
-    assert found["manipulator_pose"] <= (0.0 if exact else 1e-4), found
+    assert found["tool_pose"] <= (0.0 if exact else 1e-4), found
     assert float((whole.state.position - load_record("half").state.position).abs().max()) > 1e-3
     assert rest.run["loss_final"] == pytest.approx(whole.run["loss_final"], rel=1e-3)

@@ -9,7 +9,7 @@ from golden import SHARED
 from typer.testing import CliRunner
 
 from cpdeform.cli.main import app
-from cpdeform.core.target import load_target, load_target_grid
+from cpdeform.core.goal import load_goal, load_goal_grid
 from cpdeform.core.task import load_task
 from cpdeform.planning.objectives.mass import mass_grid
 from cpdeform.tasks.grid_import import PLASTICINELAB_NAMES, goal_name, import_grids, task_name
@@ -24,7 +24,7 @@ def directory(tmp_path, monkeypatch, make_toy_task, toy_distribution):
     monkeypatch.chdir(tmp_path)
     body = {"kind": "sphere", "position": [0.4, 0.4, 0.4], "radius": 0.1, "particle_count": COUNT}
     tool = {"kind": "Sphere", "radius": 0.05, "position": [0.4, 0.7, 0.4], "action_scale": [0.02, 0.02, 0.02]}
-    make_toy_task(scene={"bodies": [body], "manipulators": [tool]})
+    make_toy_task(scene={"bodies": [body], "tools": [tool]})
     return tmp_path
 
 
@@ -59,7 +59,7 @@ def test_particles_have_the_masses_of_the_grid(directory, grid):
     assert "goals/goal.npz: grid for shift, 800 particles, error of the node masses" in result.stdout
     assert "--set scene.sampling=plasticinelab" in result.stdout
     goal = directory / "goals" / "goal.npz"
-    position, kept = load_target(goal, scene=scene), load_target_grid(goal, scene=scene)
+    position, kept = load_goal(goal, scene=scene), load_goal_grid(goal, scene=scene)
     assert position.shape == (COUNT, 3)
     assert kept.sum() == pytest.approx(COUNT * scene.particle_volume, rel=1e-5)
     np.testing.assert_allclose(kept, grid * scene.particle_volume * COUNT / grid.sum(), rtol=1e-5, atol=1e-12)
@@ -78,7 +78,7 @@ def test_run_takes_the_goal_and_evaluate_its_grid(directory, grid):
     result = invoke("grids.npz", "--name", "one", "--task", "shift.yaml", "--particles", 300, "--out", "goal.npz")
     assert result.exit_code == 0, result.output
     parts = ["--backend", "toy", "--ot", "toy", "--placer", "toy", "--iterations", "2", "--stages", "1", "--no-pictures"]
-    run = CliRunner().invoke(app, ["run", "shift.yaml", *parts, "--target", "goal.npz", "--out", "run", "--json"])
+    run = CliRunner().invoke(app, ["run", "shift.yaml", *parts, "--goal", "goal.npz", "--out", "run", "--json"])
     assert run.exit_code == 0, run.output
     summary = json.loads(run.stdout)
     assert summary["metric_initial"] > 0.0
@@ -86,7 +86,7 @@ def test_run_takes_the_goal_and_evaluate_its_grid(directory, grid):
         found = CliRunner().invoke(app, ["evaluate", "run", "--json", "--no-rest", *flags])
         assert found.exit_code == 0, found.output
         figures = json.loads(found.stdout)
-        assert (figures["grid"], figures["particle_count"], figures["target_count"]) == ("file", COUNT, 300)
+        assert (figures["grid"], figures["particle_count"], figures["goal_count"]) == ("file", COUNT, 300)
         assert figures["wasserstein_final"] == pytest.approx(summary["metric_value"], rel=1e-3)
         assert (figures["exact_final"] is None) == ("--exact" not in flags)
         assert figures["paper_blur"] == (0.01 if "--paper" in flags else None)
@@ -133,7 +133,7 @@ def test_negative_masses_that_are_rounding_count_as_none(directory, grid):
     result = invoke("noisy.npy", "--task", "shift.yaml", "--particles", 50, "--out", "noisy.npz")
     assert result.exit_code == 0, result.output
     assert "20 negative masses" in result.stderr
-    kept = load_target_grid(directory / "noisy.npz", scene=load_task("shift.yaml").scene)
+    kept = load_goal_grid(directory / "noisy.npz", scene=load_task("shift.yaml").scene)
     assert (kept[tuple(empty.T)] == 0.0).all()
     assert kept[grid > 0.0].min() > 0.0
     for share, name in ((0.06, "deep"), (0.04, "many")):
@@ -178,7 +178,7 @@ def test_bad_options(directory, grid):
         ({"--particles": 0}, "at least 1"),
         ({"--seed": -1}, "--seed"),
         ({"--task": "wrtier"}, 'Did you mean "writer"'),
-        ({"--out": "target.npz"}, "Replace it with --overwrite"),
+        ({"--out": "goal.npz"}, "Replace it with --overwrite"),
         ({"--out": "goal.txt"}, "ends in .npz"),
         ({"--out": "shift.yaml/goal.npz"}, "cannot be written"),
         ({"--all": None}, "nothing with --all"),
@@ -220,7 +220,7 @@ def test_a_grid_of_plasticinelab(directory):
     result = invoke(path, "--name", "Writer3D-v1", "--particles", 3000, "--out", "goal.npz")
     assert result.exit_code == 0, result.output
     scene = load_task("writer-v1").scene
-    masses = mass_grid(torch.as_tensor(load_target(directory / "goal.npz", scene=scene)), scene).numpy()
-    kept = load_target_grid(directory / "goal.npz", scene=scene)
+    masses = mass_grid(torch.as_tensor(load_goal(directory / "goal.npz", scene=scene)), scene).numpy()
+    kept = load_goal_grid(directory / "goal.npz", scene=scene)
     assert kept.sum() == pytest.approx(3000 * scene.particle_volume, rel=1e-5)
     assert np.abs(masses - kept).sum() / kept.sum() < 0.02

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from cpdeform.core.scene import ManipulatorBox, ManipulatorCapsule, Material, Scene
+from cpdeform.core.scene import Material, Scene, ToolBox, ToolCapsule
 from cpdeform.core.state import initial_state
 
 BALL = {"kind": "sphere", "position": (0.5, 0.5, 0.5), "radius": 0.1, "particle_count": 500}
@@ -23,9 +23,9 @@ def test_material_constants():
 def test_derived_numbers():
     fixed = {**PEN, "action_scale": ()}
     turning = {**PEN, "action_scale": (0.0, 0.0, 0.0, 0.1, 0.1, 0.1)}
-    scene = Scene(bodies=(BALL, BLOCK), manipulators=(PEN, fixed, turning), material={"yield_stress": 10.0})
+    scene = Scene(bodies=(BALL, BLOCK), tools=(PEN, fixed, turning), material={"yield_stress": 10.0})
     assert (scene.particle_count, scene.action_size) == (800, 9)
-    assert [tool.movable for tool in scene.manipulators] == [True, False, True]
+    assert [tool.movable for tool in scene.tools] == [True, False, True]
     assert scene.node_distance == 1.0 / 64
     assert scene.particle_volume == (0.5 / 64) ** 2
     assert scene.gravity == (0.0, -30.0, 0.0)
@@ -43,12 +43,12 @@ def test_derived_numbers():
         ({"bodies": ({**BALL, "particle_count": 0},)}, "greater than 0"),
         ({"bodies": ({**BALL, "kind": "cone"},)}, "tag 'cone'"),
         ({"bodies": ({**BALL, "colour": "red"},)}, "not permitted"),
-        ({"manipulators": ({**PEN, "action_scale": (0.1,)},)}, "action_scale: got 1 components"),
-        ({"manipulators": ({**PEN, "action_scale": (-0.1, 0.0, 0.0)},)}, "greater than or equal to 0"),
-        ({"manipulators": ({**PEN, "rotation_wxyz": (1.0, 1.0, 0.0, 0.0)},)}, "unit quaternion"),
-        ({"manipulators": ({**PEN, "lower_bound": (1.0, 1.0, 1.0), "upper_bound": (0.0, 0.0, 0.0)},)}, "at most upper_bound"),
-        ({"manipulators": ({**PEN, "friction": math.inf},)}, "finite number"),
-        ({"manipulators": ({**PEN, "kind": "Hammer"},)}, "Hammer"),
+        ({"tools": ({**PEN, "action_scale": (0.1,)},)}, "action_scale: got 1 components"),
+        ({"tools": ({**PEN, "action_scale": (-0.1, 0.0, 0.0)},)}, "greater than or equal to 0"),
+        ({"tools": ({**PEN, "rotation_wxyz": (1.0, 1.0, 0.0, 0.0)},)}, "unit quaternion"),
+        ({"tools": ({**PEN, "lower_bound": (1.0, 1.0, 1.0), "upper_bound": (0.0, 0.0, 0.0)},)}, "at most upper_bound"),
+        ({"tools": ({**PEN, "friction": math.inf},)}, "finite number"),
+        ({"tools": ({**PEN, "kind": "Hammer"},)}, "Hammer"),
         ({"grid_size": 4}, "greater than or equal to 8"),
         ({"time_step": 0.0}, "greater than"),
         ({"time_step": math.nan}, "finite number"),
@@ -62,13 +62,13 @@ def test_derived_numbers():
         ({"bodies": ({**BALL, "particle_count": 2e9},)}, "less than or equal to"),
         ({"bodies": ({**BALL, "particle_count": 9_000_000},) * 2}, "18000000 particles of all bodies"),
         ({"bodies": ({**BALL, "position": ("0.5", 0.5, 0.5)},)}, "valid number"),
-        ({"manipulators": ({**PEN, "position": (1e300, 0.5, 0.5)},)}, "less than or equal to"),
+        ({"tools": ({**PEN, "position": (1e300, 0.5, 0.5)},)}, "less than or equal to"),
         ({"material": {"poisson_ratio": 0.5}}, "less than 0.5"),
     ],
 )
 def test_refuses(changes, message):
     with pytest.raises(ValidationError, match=message):
-        Scene.model_validate({"bodies": (BALL,), "manipulators": (PEN,), **changes})
+        Scene.model_validate({"bodies": (BALL,), "tools": (PEN,), **changes})
 
 
 def test_scenes_are_immutable():
@@ -78,13 +78,13 @@ def test_scenes_are_immutable():
 
 
 def test_initial_state():
-    box = ManipulatorBox(position=(0.1, 0.2, 0.3), rotation_wxyz=(0.6, 0.0, 0.8, 0.0), half_extents=(0.1, 0.1, 0.1))
-    scene = Scene(bodies=(BALL,), manipulators=(box, ManipulatorCapsule(**{k: v for k, v in PEN.items() if k != "kind"})))
+    box = ToolBox(position=(0.1, 0.2, 0.3), rotation_wxyz=(0.6, 0.0, 0.8, 0.0), half_extents=(0.1, 0.1, 0.1))
+    scene = Scene(bodies=(BALL,), tools=(box, ToolCapsule(**{k: v for k, v in PEN.items() if k != "kind"})))
     state = initial_state(scene, batch_size=2)
     assert (state.batch_size, state.particle_count) == (2, 500)
     assert not state.velocity.any()
     assert not state.elastic_strain.any()
-    assert state.manipulator_pose[1, 0].tolist() == pytest.approx([0.1, 0.2, 0.3, 0.6, 0.0, 0.8, 0.0, 0.0])
+    assert state.tool_pose[1, 0].tolist() == pytest.approx([0.1, 0.2, 0.3, 0.6, 0.0, 0.8, 0.0, 0.0])
 
 
 def test_a_number_without_a_fraction_is_a_whole_number():

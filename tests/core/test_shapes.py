@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from toy_cone import ManipulatorCone, ShapeCone
+from toy_cone import ShapeCone, ToolCone
 
 from cpdeform.backends.scene_numbers import MOST_LENGTHS, tool_size
 from cpdeform.core.errors import InputError
@@ -14,40 +14,40 @@ from cpdeform.core.rotation import from_rotation_vector, rotate
 from cpdeform.core.scene import (
     BodyBox,
     BodySphere,
-    ManipulatorBase,
-    ManipulatorBox,
-    ManipulatorCapsule,
-    ManipulatorChopsticks,
-    ManipulatorCylinder,
-    ManipulatorRollingPin,
-    ManipulatorSphere,
-    ManipulatorTorus,
+    ToolBase,
+    ToolBox,
+    ToolCapsule,
+    ToolChopsticks,
+    ToolCylinder,
+    ToolRollingPin,
+    ToolSphere,
+    ToolTorus,
 )
 from cpdeform.core.shapes.base import Shape
 from cpdeform.core.shapes.box import ARC_POINTS, ShapeBox
-from cpdeform.core.shapes.kinds import BODIES, MANIPULATORS
+from cpdeform.core.shapes.kinds import BODIES, TOOLS
 from cpdeform.core.signed_distance import local_distance, signed_distance
 from cpdeform.placement.tool import surface_points, tool_half_extents
 from cpdeform.report.shapes import tool_surface
 from cpdeform.tasks.solids import even_points
 
 ORIGIN = (0.0, 0.0, 0.0)
-EXAMPLES: dict[str, ManipulatorBase | BodyBox | BodySphere] = {
-    "sphere": ManipulatorSphere(position=ORIGIN, radius=0.1),
-    "capsule": ManipulatorCapsule(position=ORIGIN, radius=0.05, height=0.12),
-    "rolling pin": ManipulatorRollingPin(position=ORIGIN, radius=0.04, height=0.2),
-    "chopsticks": ManipulatorChopsticks(position=ORIGIN, radius=0.03, height=0.1, gap=0.09),
-    "chopsticks that overlap": ManipulatorChopsticks(position=ORIGIN, radius=0.05, height=0.1, gap=0.07),
-    "box": ManipulatorBox(position=ORIGIN, half_extents=(0.05, 0.1, 0.07)),
-    "rounded box": ManipulatorBox(position=ORIGIN, half_extents=(0.05, 0.1, 0.02), rounding=0.03),
-    "cylinder": ManipulatorCylinder(position=ORIGIN, radius=0.08, half_height=0.05),
-    "torus": ManipulatorTorus(position=ORIGIN, major_radius=0.08, tube_radius=0.03),
+EXAMPLES: dict[str, ToolBase | BodyBox | BodySphere] = {
+    "sphere": ToolSphere(position=ORIGIN, radius=0.1),
+    "capsule": ToolCapsule(position=ORIGIN, radius=0.05, height=0.12),
+    "rolling pin": ToolRollingPin(position=ORIGIN, radius=0.04, height=0.2),
+    "chopsticks": ToolChopsticks(position=ORIGIN, radius=0.03, height=0.1, gap=0.09),
+    "chopsticks that overlap": ToolChopsticks(position=ORIGIN, radius=0.05, height=0.1, gap=0.07),
+    "box": ToolBox(position=ORIGIN, half_extents=(0.05, 0.1, 0.07)),
+    "rounded box": ToolBox(position=ORIGIN, half_extents=(0.05, 0.1, 0.02), rounding=0.03),
+    "cylinder": ToolCylinder(position=ORIGIN, radius=0.08, half_height=0.05),
+    "torus": ToolTorus(position=ORIGIN, major_radius=0.08, tube_radius=0.03),
     "box of clay": BodyBox(position=(0.5, 0.4, 0.3), widths=(0.1, 0.2, 0.3)),
     "ball of clay": BodySphere(position=(0.5, 0.4, 0.3), radius=0.1),
-    "cone": ManipulatorCone(position=ORIGIN, radius=0.08, height=0.15),
+    "cone": ToolCone(position=ORIGIN, radius=0.08, height=0.15),
 }
 SHAPES = {name: example.shape() for name, example in EXAMPLES.items()} | {
-    "torus without a hole": ManipulatorTorus(position=ORIGIN, major_radius=0.03, tube_radius=0.06).shape()
+    "torus without a hole": ToolTorus(position=ORIGIN, major_radius=0.03, tube_radius=0.06).shape()
 }
 CLOSED = [name for name in SHAPES if name not in ("torus without a hole", "chopsticks that overlap")]
 """Shapes whose mesh is their surface and nothing inside it."""
@@ -73,7 +73,7 @@ def inside(shape: Shape) -> Tensor:
 
 
 def test_every_kind_has_an_example() -> None:
-    assert {type(example) for example in EXAMPLES.values()} == {*MANIPULATORS.values(), *BODIES.values(), ManipulatorCone}
+    assert {type(example) for example in EXAMPLES.values()} == {*TOOLS.values(), *BODIES.values(), ToolCone}
 
 
 @pytest.mark.parametrize("name", CLOSED)
@@ -143,24 +143,24 @@ def test_bodies_are_their_shapes_about_their_centres(name: str) -> None:
     assert bool((particles.abs().amax(dim=0) > 0.9 * torch.tensor(body.half_extents)).all())
 
 
-@pytest.mark.parametrize("kind", MANIPULATORS)
+@pytest.mark.parametrize("kind", TOOLS)
 def test_kernels_get_a_kinds_lengths_in_order(kind: str) -> None:
-    tool = next(example for example in EXAMPLES.values() if type(example) is MANIPULATORS[kind])
-    assert isinstance(tool, ManipulatorBase)
+    tool = next(example for example in EXAMPLES.values() if type(example) is TOOLS[kind])
+    assert isinstance(tool, ToolBase)
     size = tool_size(tool)
     assert len(size) == MOST_LENGTHS
-    own = {name for name in type(tool).model_fields if name not in (*ManipulatorBase.model_fields, "kind", "gap")}
+    own = {name for name in type(tool).model_fields if name not in (*ToolBase.model_fields, "kind", "gap")}
     lengths = [length for name in type(tool).model_fields if name in own for length in np.atleast_1d(getattr(tool, name))]
     assert list(size) == [*lengths, *[0.0] * (MOST_LENGTHS - len(lengths))]
 
 
 def test_only_a_flat_tool_has_a_thinnest_axis() -> None:
-    axes = {name: example.thinnest_axis for name, example in EXAMPLES.items() if isinstance(example, ManipulatorBase)}
+    axes = {name: example.thinnest_axis for name, example in EXAMPLES.items() if isinstance(example, ToolBase)}
     assert {name: axis for name, axis in axes.items() if axis is not None} == {"box": 0, "rounded box": 2}
 
 
 def test_shapes_with_tensors_of_gaps_broadcast() -> None:
-    tool = ManipulatorChopsticks(position=ORIGIN, radius=0.03, height=0.1)
+    tool = ToolChopsticks(position=ORIGIN, radius=0.03, height=0.1)
     gaps, points = torch.tensor([[0.06], [0.1]]), torch.rand(7, 3)
     both = local_distance(tool, *points.unbind(-1), gap=gaps)
     assert torch.equal(both, torch.stack([local_distance(tool, *points.unbind(-1), gap=float(gap)) for gap in gaps]))
@@ -178,25 +178,25 @@ def test_shapes_with_tensors_of_gaps_broadcast() -> None:
     ],
 )
 def test_what_is_no_tool_is_refused(ask) -> None:
-    with pytest.raises(InputError, match=r"manipulator: got ShapeBox, expected a manipulator of cpdeform\.core\.scene"):
+    with pytest.raises(InputError, match=r"tool: got ShapeBox, expected a tool of cpdeform\.core\.scene"):
         ask(ShapeBox((0.1, 0.1, 0.1)))
 
 
 def test_a_kind_without_geometry_cannot_be_made() -> None:
-    class ManipulatorSpoon(ManipulatorBase):
+    class ToolSpoon(ToolBase):
         kind: str = "Spoon"
 
     with pytest.raises(TypeError, match="shape"):
-        ManipulatorSpoon(position=ORIGIN)
+        ToolSpoon(position=ORIGIN)
 
 
 def test_too_many_lengths_for_kernels_are_refused() -> None:
-    class ManipulatorStar(ManipulatorCone):
+    class ToolStar(ToolCone):
         @property
         def kernel_lengths(self) -> tuple[float, ...]:
             return (1.0, 2.0, 3.0, 4.0, 5.0)
 
-    star = ManipulatorStar(position=ORIGIN, radius=0.1, height=0.1)
+    star = ToolStar(position=ORIGIN, radius=0.1, height=0.1)
     assert isinstance(star.shape(), ShapeCone)
     with pytest.raises(InputError, match=r"Cone\.kernel_lengths: got 5 lengths, expected at most 4"):
         tool_size(star)

@@ -13,33 +13,33 @@ from torch import Tensor
 from cpdeform.core.errors import InputError
 from cpdeform.core.rotation import from_rotation_vector, multiply, rotate
 from cpdeform.core.scene import (
-    Manipulator,
-    ManipulatorBox,
-    ManipulatorCapsule,
-    ManipulatorChopsticks,
-    ManipulatorCylinder,
-    ManipulatorRollingPin,
-    ManipulatorSphere,
-    ManipulatorTorus,
+    Tool,
+    ToolBox,
+    ToolCapsule,
+    ToolChopsticks,
+    ToolCylinder,
+    ToolRollingPin,
+    ToolSphere,
+    ToolTorus,
 )
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.placement.tool import surface_points, tool_half_extents
 
 ORIGIN = (0.0, 0.0, 0.0)
-TOOLS: dict[str, Manipulator] = {
-    "sphere": ManipulatorSphere(position=ORIGIN, radius=0.3),
-    "capsule": ManipulatorCapsule(position=ORIGIN, radius=0.1, height=0.4),
-    "box": ManipulatorBox(position=ORIGIN, half_extents=(0.1, 0.2, 0.3)),
-    "rounded": ManipulatorBox(position=ORIGIN, half_extents=(0.1, 0.2, 0.3), rounding=0.05),
-    "cylinder": ManipulatorCylinder(position=ORIGIN, radius=0.2, half_height=0.3),
-    "rolling pin": ManipulatorRollingPin(position=ORIGIN, radius=0.1, height=0.4),
-    "torus": ManipulatorTorus(position=ORIGIN, major_radius=0.3, tube_radius=0.1),
+TOOLS: dict[str, Tool] = {
+    "sphere": ToolSphere(position=ORIGIN, radius=0.3),
+    "capsule": ToolCapsule(position=ORIGIN, radius=0.1, height=0.4),
+    "box": ToolBox(position=ORIGIN, half_extents=(0.1, 0.2, 0.3)),
+    "rounded": ToolBox(position=ORIGIN, half_extents=(0.1, 0.2, 0.3), rounding=0.05),
+    "cylinder": ToolCylinder(position=ORIGIN, radius=0.2, half_height=0.3),
+    "rolling pin": ToolRollingPin(position=ORIGIN, radius=0.1, height=0.4),
+    "torus": ToolTorus(position=ORIGIN, major_radius=0.3, tube_radius=0.1),
 }
 IDENTITY = torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 every_tool = pytest.mark.parametrize("name", TOOLS)
 
 
-def at(tool: Manipulator, *point: float) -> float:
+def at(tool: Tool, *point: float) -> float:
     return float(signed_distance(tool, IDENTITY, torch.tensor([point], dtype=torch.float64))[0])
 
 
@@ -159,7 +159,7 @@ def test_same_values_with_and_without_gradient(name: str) -> None:
     )
 
 
-CHOPSTICKS = ManipulatorChopsticks(position=ORIGIN, radius=0.1, height=0.4, gap=0.5)
+CHOPSTICKS = ToolChopsticks(position=ORIGIN, radius=0.1, height=0.4, gap=0.5)
 
 
 @pytest.mark.parametrize(

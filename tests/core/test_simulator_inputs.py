@@ -15,7 +15,7 @@ from cpdeform.core.simulator_inputs import POSITION_SLACK, QUATERNION_SLACK
 
 BODY = {"kind": "box", "position": (0.5, 0.16, 0.5), "widths": (0.12, 0.1, 0.12), "particle_count": 20}
 TOOL = {"kind": "Sphere", "radius": 0.03, "position": (0.5, 0.4, 0.5), "action_scale": (0.02, 0.02, 0.02)}
-SCENE = Scene.model_validate({"bodies": [BODY], "manipulators": [TOOL], "grid_size": 32, "ground_height": 0.05})
+SCENE = Scene.model_validate({"bodies": [BODY], "tools": [TOOL], "grid_size": 32, "ground_height": 0.05})
 
 
 @pytest.fixture
@@ -40,15 +40,15 @@ def with_number(state, name, index, value):
         ("affine", (0, 7), math.nan, r"state.affine: got 9 of 360 numbers not finite"),
         ("elastic_strain", (0, 0, 5), -math.inf, r"state.elastic_strain: got .* -inf \(world 0, particle 0, component 5\)"),
         (
-            "manipulator_pose",
+            "tool_pose",
             (1, 0, 0),
             1e6,
-            r"state.manipulator_pose: got 1e\+06 \(world 1, tool 0, component 0\), .* from -100 to 101",
+            r"state.tool_pose: got 1e\+06 \(world 1, tool 0, component 0\), .* from -100 to 101",
         ),
-        ("manipulator_pose", (1, 0, 4), math.nan, r"state.manipulator_pose: got 1 of 2 numbers not finite.*\(world 1, tool 0\)"),
-        ("manipulator_pose", (0, 0, slice(3, 7)), 0.0, r"state.manipulator_pose: got 0 \(world 0, tool 0\).* unit quaternions"),
-        ("manipulator_pose", (0, 0, 3), 1.1, r"state.manipulator_pose: got 1.1 .* Divide them by their length"),
-        ("manipulator_pose", (0, 0, 7), 40.0, r"state.manipulator_pose: got 40 .* gaps"),
+        ("tool_pose", (1, 0, 4), math.nan, r"state.tool_pose: got 1 of 2 numbers not finite.*\(world 1, tool 0\)"),
+        ("tool_pose", (0, 0, slice(3, 7)), 0.0, r"state.tool_pose: got 0 \(world 0, tool 0\).* unit quaternions"),
+        ("tool_pose", (0, 0, 3), 1.1, r"state.tool_pose: got 1.1 .* Divide them by their length"),
+        ("tool_pose", (0, 0, 7), 40.0, r"state.tool_pose: got 40 .* gaps"),
     ],
 )
 def test_senseless_states_are_refused(simulator, name, index, value, message):
@@ -78,7 +78,7 @@ def test_rounding_and_the_bounds_themselves_pass(simulator):
     slack = 0.9 * POSITION_SLACK * SCENE.node_distance
     for index, value in (((0, 0, 0), low - slack), ((0, 0, 1), floor - slack), ((1, 0, 2), high + slack)):
         state = with_number(state, "position", index, value)
-    state = with_number(state, "manipulator_pose", (0, 0, slice(3, 7)), 0.5 * (1.0 + 0.9 * QUATERNION_SLACK))
+    state = with_number(state, "tool_pose", (0, 0, slice(3, 7)), 0.5 * (1.0 + 0.9 * QUATERNION_SLACK))
     actions = torch.ones(2, 1, 3, dtype=torch.float64) * torch.tensor([1.0 + 1e-6, -1.0 - 1e-6, 1.0], dtype=torch.float64)
     simulator.check_inputs(state, actions)
     simulator.check_inputs(state, torch.ones(2, 1, 3, dtype=torch.float32, requires_grad=True))
@@ -86,5 +86,5 @@ def test_rounding_and_the_bounds_themselves_pass(simulator):
 
 
 def test_a_scene_without_tools_passes():
-    simulator = SimulatorToy(SCENE.model_copy(update={"manipulators": ()}))
+    simulator = SimulatorToy(SCENE.model_copy(update={"tools": ()}))
     simulator.check_inputs(simulator.initial_state(), torch.zeros(1, 2, 0))

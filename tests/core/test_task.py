@@ -5,16 +5,16 @@ import pytest
 import yaml
 
 from cpdeform.core.errors import InputError, PluginError, UnknownNameError
+from cpdeform.core.goal import load_goal_grid
 from cpdeform.core.plugins import load_registry, split_options
-from cpdeform.core.target import load_target_grid
-from cpdeform.core.task import Task, list_variants, load_target, load_task, merge, read_task, validate
+from cpdeform.core.task import Task, list_variants, load_goal, load_task, merge, read_task, validate
 from cpdeform.run.configuration import RunConfiguration
 
 
 def test_reads_a_task(toy_task_file):
     task = load_task(str(toy_task_file))
     assert (task.name, task.step_count, task.scene.particle_count) == ("shift", 5, 60)
-    assert task.load_target().shape == (60, 3)
+    assert task.load_goal().shape == (60, 3)
     assert Task.model_validate_json(task.model_dump_json()) == task
 
 
@@ -59,12 +59,12 @@ def test_package_of_a_task_is_missing(monkeypatch, toy_entry_points):
         ("variants: {v1: 3}", r"variants\.v1"),
         ("name: x", "field required"),
         (
-            "name: x\nscen: {}\ntarget: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radius: .1}]}",
+            "name: x\nscen: {}\ngoal: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radius: .1}]}",
             'Did you mean "scene"',
         ),
-        ("target: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radius: -1}]}", r"bodies\.0\.sphere\.radius"),
-        ("target: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radis: .1, radius: .1}]}", 'Did you mean "radius"'),
-        ("target: t\nscene: {bodies: [{kind: sphere, position: [.9,.9,.9], radius: .3}]}", "inside the domain"),
+        ("goal: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radius: -1}]}", r"bodies\.0\.sphere\.radius"),
+        ("goal: t\nscene: {bodies: [{kind: sphere, position: [.5,.5,.5], radis: .1, radius: .1}]}", 'Did you mean "radius"'),
+        ("goal: t\nscene: {bodies: [{kind: sphere, position: [.9,.9,.9], radius: .3}]}", "inside the domain"),
     ],
 )
 def test_bad_task_files(tmp_path, content, message):
@@ -84,10 +84,10 @@ def test_unreadable_task_files(tmp_path):
         read_task(tmp_path)
 
 
-def test_compact_targets(tmp_path, toy_task_file):
+def test_compact_goals(tmp_path, toy_task_file):
     scene = load_task(toy_task_file).scene
     np.save(tmp_path / "t.npy", np.full((2, 3), 2**15, dtype=np.uint16))
-    np.testing.assert_array_equal(load_target(tmp_path / "t.npy", scene=scene), np.full((2, 3), 0.5))
+    np.testing.assert_array_equal(load_goal(tmp_path / "t.npy", scene=scene), np.full((2, 3), 0.5))
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_compact_targets(tmp_path, toy_task_file):
         ({"other": np.zeros((4, 3))}, "no array of that name"),
     ],
 )
-def test_bad_targets(tmp_path, toy_task_file, content, message):
+def test_bad_goals(tmp_path, toy_task_file, content, message):
     path = tmp_path / "bad.npz"
     if isinstance(content, bytes):
         path.write_bytes(content)
@@ -114,7 +114,7 @@ def test_bad_targets(tmp_path, toy_task_file, content, message):
     elif content is not None:
         np.savez(path, position=content)
     with pytest.raises(InputError, match=message):
-        load_target(path, scene=load_task(toy_task_file).scene)
+        load_goal(path, scene=load_task(toy_task_file).scene)
 
 
 def test_merge():
@@ -193,14 +193,14 @@ def test_a_tasks_name_is_no_path(make_toy_task, name):
         ({"grid_cells": [[0.0, 0.0, 1.0]], "grid_mass": [1.0]}, "grid_cells: got float64"),
     ],
 )
-def test_bad_grids_of_targets(tmp_path, toy_task_file, arrays, message):
+def test_bad_grids_of_goals(tmp_path, toy_task_file, arrays, message):
     np.savez(tmp_path / "bad.npz", position=np.full((4, 3), 0.5), **{name: np.array(values) for name, values in arrays.items()})
     with pytest.raises(InputError, match=message):
-        load_target_grid(tmp_path / "bad.npz", scene=load_task(toy_task_file).scene)
+        load_goal_grid(tmp_path / "bad.npz", scene=load_task(toy_task_file).scene)
 
 
 def test_another_format_as_goal_is_called_that(tmp_path, toy_task_file):
     (tmp_path / "goal.ply").write_text("ply\nformat ascii 1.0\n")
     with pytest.raises(InputError, match=r"it begins with .*ply.*expected an \.npz, \.npy or \.h5 file") as caught:
-        load_target(tmp_path / "goal.ply", scene=load_task(toy_task_file).scene)
+        load_goal(tmp_path / "goal.ply", scene=load_task(toy_task_file).scene)
     assert "pickle" not in str(caught.value)

@@ -125,7 +125,7 @@ def test_the_pen_touches_the_board():
     assert not torch.equal(actions[0], actions[1])
     trajectory = simulator.rollout(simulator.initial_state(), actions)
     # lowest point of the pen, which is a capsule
-    assert bool((trajectory.manipulator_poses[:, -1, 0, 1] - 0.06 < 0.09).all())
+    assert bool((trajectory.tool_poses[:, -1, 0, 1] - 0.06 < 0.09).all())
 
 
 @pytest.mark.slow

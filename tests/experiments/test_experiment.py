@@ -87,7 +87,7 @@ def test_rows_and_records(made):
         floor = row["w1_floor"]
         assert row["ratio_above_floor"] == pytest.approx((row["w1_final"] - floor) / (row["w1_initial"] - floor))
         start, final = record.stages[0].state_before.position[0], record.stages[-1].state.position[0]
-        begin, end, goal = (mass_grid(points.double(), record.task.scene) for points in (start, final, record.target))
+        begin, end, goal = (mass_grid(points.double(), record.task.scene) for points in (start, final, record.goal))
         way = soft_iou(goal, goal) - soft_iou(begin, goal)
         assert row["incremental_iou"] == pytest.approx(float((soft_iou(end, goal) - soft_iou(begin, goal)) / way), rel=1e-3)
         assert 0.01 < row["incremental_iou"] < 0.99
@@ -129,8 +129,8 @@ def test_another_configuration_runs_again(copied):
         assert [row["reused"] for row in table()] == ["False"]
     record = load_record("out/shift/fixed-seed0")
     assert record.run["configuration"]["optimizer"]["learning_rate"] == 0.2
-    moved = np.load("target.npz")["position"] + [0.0, 0.01, 0.0]
-    np.savez("target.npz", position=moved)
+    moved = np.load("goal.npz")["position"] + [0.0, 0.01, 0.0]
+    np.savez("goal.npz", position=moved)
     assert run_toy("--out", "out").exit_code == 0
     assert [row["reused"] for row in table()] == ["False"]
 
@@ -201,7 +201,7 @@ def test_failures_are_rows(copied, monkeypatch):
 
 
 def test_stages_without_a_plan_are_rows(copied):
-    finished = run_toy("--set", "scene.manipulators.0.action_scale=[1e-30,1e-30,1e-30]", "--out", "still")
+    finished = run_toy("--set", "scene.tools.0.action_scale=[1e-30,1e-30,1e-30]", "--out", "still")
     assert finished.exit_code == 0, finished.output
     (row,) = table("still")
     assert (row["status"], row["stages"], row["stages_tried"]) == ("no_improvement", "0", "1")
@@ -212,16 +212,16 @@ def test_stages_without_a_plan_are_rows(copied):
 def test_goals_from_a_directory(copied):
     goals = copied / "goals"
     goals.mkdir()
-    finished = run_toy("--targets", goals, "--out", "goal")
+    finished = run_toy("--goals", goals, "--out", "goal")
     assert finished.exit_code == 1
     (row,) = table("goal")
     assert row["status"] == "failed"
     assert "no file shift.npz" in row["reason"]
-    position = np.load("target.npz")["position"][:40]
+    position = np.load("goal.npz")["position"][:40]
     np.savez(goals / "shift.npz", position=position)
-    finished = run_toy("--targets", goals, "--out", "goal")
+    finished = run_toy("--goals", goals, "--out", "goal")
     assert finished.exit_code == 0, finished.output
-    assert len(load_record("goal/shift/fixed-seed0").target) == 40
+    assert len(load_record("goal/shift/fixed-seed0").goal) == 40
     text = (copied / "goal" / "table.md").read_text()
     assert "goal=a given file" in text
     assert "another number of particles" in text
@@ -237,7 +237,7 @@ def test_particles_are_shared_out(copied):
     assert run_toy(*setting, "--particles", "31", "--out", "fewer").exit_code == 0
     record = load_record("fewer/shift/fixed-seed0")
     assert [body.particle_count for body in record.task.scene.bodies] == [10, 21]
-    assert len(record.target) == 60
+    assert len(record.goal) == 60
     assert run_toy(*setting, "--particles", "1", "--out", "fewer").exit_code == 1
     assert "at least 2" in table("fewer")[0]["reason"]
 
@@ -301,7 +301,7 @@ def test_variants_of_tasks():
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("target file /data/a b.npz: bad", "target file a b.npz: bad"),
+        ("goal file /data/a b.npz: bad", "goal file a b.npz: bad"),
         ("'/home/somebody/x/y.npz', got 1/2", "'y.npz', got 1/2"),
         ("relative/path.npz and https://example.org/a", "relative/path.npz and https://example.org/a"),
     ],

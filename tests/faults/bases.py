@@ -10,8 +10,8 @@ import h5py
 import numpy as np
 from toy_fixtures import write_toy_task
 
+from cpdeform.core.goal import write_goal
 from cpdeform.core.plugins import Registry, load_registry
-from cpdeform.core.target import write_target
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.deform import deform
@@ -21,7 +21,7 @@ GRID_SIZE = 16
 SCENE = {
     "grid_size": GRID_SIZE,
     "bodies": [{"kind": "sphere", "position": [0.4, 0.4, 0.4], "radius": 0.1, "particle_count": 60}],
-    "manipulators": [{"kind": "Sphere", "radius": 0.05, "position": [0.4, 0.7, 0.4], "action_scale": [0.02, 0.02, 0.02]}],
+    "tools": [{"kind": "Sphere", "radius": 0.05, "position": [0.4, 0.7, 0.4], "action_scale": [0.02, 0.02, 0.02]}],
 }
 
 
@@ -35,13 +35,13 @@ def make_bases(directory: Path) -> Path:
     """Goals, grids, a task, a run record and a recording of PlasticineLab's form."""
     generator = np.random.default_rng(0)
     (directory / "task").mkdir(parents=True)
-    limits = {"manipulators": {"0": {"friction": 0.5, "lower_bound": [0.0, 0.01, 0.0]}}}
+    limits = {"tools": {"0": {"friction": 0.5, "lower_bound": [0.0, 0.01, 0.0]}}}
     variants = {"v1": {"step_count": 4}, "v2": {"scene": {"bodies": {"0": {"radius": 0.05}}}}}
     task = write_toy_task(directory / "task", scene=SCENE, limits=limits, variants=variants, rest_steps=1)
     positions = generator.uniform(0.3, 0.6, (200, 3))
     grid = np.zeros((GRID_SIZE,) * 3)
     grid[5:9, 5:9, 5:9] = generator.uniform(0.1, 1.0, (4, 4, 4))
-    write_target(directory / "goal.npz", positions, grid=grid, corresponds=True)
+    write_goal(directory / "goal.npz", positions, grid=grid, corresponds=True)
     np.savez_compressed(directory / "plain.npz", position=positions)
     np.save(directory / "plain.npy", positions.astype(np.float32))
     with h5py.File(directory / "goal.h5", "w") as file:

@@ -25,7 +25,7 @@ from bases import make_bases, registry_with_toys
 
 from cpdeform.cli.run import resolve_command
 from cpdeform.core.errors import MESSAGE_LENGTH, CpdeformError, InputError
-from cpdeform.core.target import load_correspondence, load_target, load_target_grid
+from cpdeform.core.goal import load_correspondence, load_goal, load_goal_grid
 from cpdeform.core.task import list_variants, read_task
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record import load_record
@@ -90,8 +90,8 @@ class Campaign:
         self._damage_arrays(path)
         scene = read_task(self.bases / "task" / "shift.yaml").scene
         readers: tuple[Callable[[], Any], ...] = (
-            lambda: load_target(path, scene=scene),
-            lambda: load_target_grid(path, scene=scene),
+            lambda: load_goal(path, scene=scene),
+            lambda: load_goal_grid(path, scene=scene),
             lambda: load_correspondence(path),
         )
         each(readers)
@@ -108,7 +108,7 @@ class Campaign:
 
     def record(self) -> None:
         directory = self._copy("record")
-        path = directory / self.choice.choice(("run.json", "metrics.jsonl", "target.h5", "stage-000.h5", "stage-001.h5"))
+        path = directory / self.choice.choice(("run.json", "metrics.jsonl", "goal.h5", "stage-000.h5", "stage-001.h5"))
         if path.suffix == ".h5":
             self._damage_arrays(path)
         elif self.choice.random() < 0.1:
@@ -126,9 +126,9 @@ class Campaign:
         resumed = resolve({}, record=record, registry=self.registry)
         each(
             (
-                resumed.task.load_target,
-                resumed.task.load_target_grid,
-                resumed.task.target_corresponds,
+                resumed.task.load_goal,
+                resumed.task.load_goal_grid,
+                resumed.task.goal_corresponds,
                 lambda: record.state,
             )
         )
@@ -136,12 +136,12 @@ class Campaign:
     def golden(self) -> None:
         root = self._copy("recordings")
         path = root / "golden" / "torus-v2-seed0.npz"
-        scenes, targets = root / "plasticinelab" / "scenes.json", root / "plasticinelab" / "target_grids.npz"
+        scenes, goals = root / "plasticinelab" / "scenes.json", root / "plasticinelab" / "target_grids.npz"
         chosen = self.choice.random()
         if chosen < 0.7:
             self._damage_arrays(path)
         elif chosen < 0.85:
-            self._damage_arrays(targets)
+            self._damage_arrays(goals)
         else:
             scenes.write_text(json.dumps(damage.change_value(json.loads(scenes.read_text()), self.choice)))
         read_golden(path)
@@ -164,7 +164,7 @@ class Campaign:
         each((lambda: list_variants(path),))
         task = read_task(path)
         resolve({"task": str(path)}, registry=self.registry)
-        each((task.load_target, task.load_target_grid, task.target_corresponds))
+        each((task.load_goal, task.load_goal_grid, task.goal_corresponds))
 
     def setting(self) -> None:
         task = self.bases / "task" / "shift.yaml"
@@ -178,7 +178,7 @@ class Campaign:
         text = damage.bomb(self.choice) if self.choice.random() < 0.1 else damage.text_of(damage.value(self.choice), self.choice)
         setting = ".".join(place) + ("=" if self.choice.random() < 0.98 else "") + text
         changed = resolve_command({"task": str(task)} if place[0] != "task" else {}, [setting]).task
-        each((changed.load_target, changed.load_target_grid))
+        each((changed.load_goal, changed.load_goal_grid))
 
 
 def each(readers: tuple[Callable[[], Any], ...]) -> None:

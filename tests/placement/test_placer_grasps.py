@@ -12,7 +12,7 @@ from torch import Tensor
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate, Proposal, Stage
 from cpdeform.core.rotation import rotate
-from cpdeform.core.scene import BodyBox, ManipulatorBase, ManipulatorBox, ManipulatorSphere, Scene
+from cpdeform.core.scene import BodyBox, Scene, ToolBase, ToolBox, ToolSphere
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
 from cpdeform.placement.pose import GRASP_DIRECTIONS, turned
@@ -26,9 +26,9 @@ SCALE = (0.01, 0.01, 0.01)
 PLATE = {"half_extents": (0.015, 0.125, 0.06), "rounding": 0.01, "action_scale": SCALE}
 
 
-def make_stage(bodies: list[dict[str, Any]], tools: list[ManipulatorBase], peak: tuple[float, float, float]) -> Stage:
+def make_stage(bodies: list[dict[str, Any]], tools: list[ToolBase], peak: tuple[float, float, float]) -> Stage:
     """Priorities fall off with the distance to a peak."""
-    scene = Scene(bodies=tuple(BodyBox(**body) for body in bodies), manipulators=tuple(tools))
+    scene = Scene(bodies=tuple(BodyBox(**body) for body in bodies), tools=tuple(tools))
     state = initial_state(scene, dtype=torch.float64)
     distance = (state.position[0] - torch.tensor(peak).to(state.position)).norm(dim=1)
     priorities = 0.03 * torch.exp(-((distance / 0.05) ** 2))
@@ -40,16 +40,16 @@ def block(**changes: Any) -> dict[str, Any]:
     return {"position": (0.5, 0.4, 0.5), "widths": (0.14, 0.1, 0.2), "particle_count": 3000} | changes
 
 
-def plates() -> list[ManipulatorBase]:
-    return [ManipulatorBox(position=(x, 0.4, 0.5), **PLATE) for x in (0.3, 0.7)]
+def plates() -> list[ToolBase]:
+    return [ToolBox(position=(x, 0.4, 0.5), **PLATE) for x in (0.3, 0.7)]
 
 
-def balls(*positions: tuple[float, float, float]) -> list[ManipulatorBase]:
-    return [ManipulatorSphere(radius=0.03, position=position, action_scale=SCALE) for position in positions]
+def balls(*positions: tuple[float, float, float]) -> list[ToolBase]:
+    return [ToolSphere(radius=0.03, position=position, action_scale=SCALE) for position in positions]
 
 
 def gaps(stage: Stage, placement: Proposal) -> list[float]:
-    tools = zip(stage.scene.manipulators, placement.pose, strict=True)
+    tools = zip(stage.scene.tools, placement.pose, strict=True)
     return [float(signed_distance(tool, pose, stage.state.position[0]).min()) for tool, pose in tools]
 
 
@@ -123,7 +123,7 @@ def test_pairs_share_out_the_bodies() -> None:
     front_back = next(placement for placement in placements if placement.label == "front-back")
     middles = sorted(front_back.pose[:, 0].reshape(3, 2).mean(dim=1).tolist())
     assert middles == pytest.approx([0.3, 0.5, 0.7], abs=0.08)
-    tools = zip(stage.scene.manipulators, front_back.pose, strict=True)
+    tools = zip(stage.scene.tools, front_back.pose, strict=True)
     for number, (tool, pose) in enumerate(tools):
         others = torch.cat([front_back.pose[:number, :3], front_back.pose[number + 1 :, :3]])
         assert float(signed_distance(tool, pose, others).min()) >= 0.03
@@ -147,7 +147,7 @@ def test_explored_particles_are_not_proposed_again() -> None:
 
 
 def test_a_contact_point_out_of_reach_is_passed_over() -> None:
-    tools = [ManipulatorSphere(radius=0.03, position=(0.5, 0.6, 0.5), action_scale=SCALE, lower_bound=(0.0, 0.4, 0.0))]
+    tools = [ToolSphere(radius=0.03, position=(0.5, 0.6, 0.5), action_scale=SCALE, lower_bound=(0.0, 0.4, 0.0))]
     stage = make_stage([block()], tools, (0.5, 0.35, 0.5))
     (placement,) = PlacerTransport(rounds=1).ask(stage)
     # nor do tools that stay where they are stand in for it
@@ -161,12 +161,12 @@ def test_a_contact_point_out_of_reach_is_passed_over() -> None:
 def test_current_and_apart() -> None:
     stage = make_stage([block(widths=(0.4, 0.06, 0.06))], balls((0.2, 0.4, 0.5), (0.8, 0.4, 0.5)), (0.65, 0.4, 0.5))
     current, apart = PlacerTransport(proposers=["current", "apart"]).ask(stage)
-    assert torch.equal(current.pose, stage.state.manipulator_pose[0])
+    assert torch.equal(current.pose, stage.state.tool_pose[0])
     assert float((apart.pose[0, :3] - apart.pose[1, :3]).norm()) > 0.06
     assert all(0.0 <= gap < 1e-3 for gap in gaps(stage, apart))
-    inside = stage.state.manipulator_pose.clone()
+    inside = stage.state.tool_pose.clone()
     inside[0, 0, 0] = 0.5
-    moved = Stage(0, stage.scene, stage.state.with_manipulators(inside), stage.target, stage.transport, stage.generator)
+    moved = Stage(0, stage.scene, stage.state.with_tools(inside), stage.goal, stage.transport, stage.generator)
     assert [item.label for item in PlacerTransport(proposers=["current", "apart"]).ask(moved)] == ["apart"]
 
 

@@ -9,31 +9,31 @@ import torch
 
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.placer import Stage
-from cpdeform.core.scene import BodyBox, Manipulator, ManipulatorBox, ManipulatorCylinder, ManipulatorSphere, Scene
+from cpdeform.core.scene import BodyBox, Scene, Tool, ToolBox, ToolCylinder, ToolSphere
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
-from cpdeform.placement.grid import GridOptions, ToolGrid, movable_manipulators
+from cpdeform.placement.grid import GridOptions, ToolGrid, movable_tools
 from cpdeform.testing.placer import transport_of
 
 MOVES = (0.01, 0.01, 0.01)
 
 
-def ball(**options: Any) -> ManipulatorSphere:
-    return ManipulatorSphere(**{"position": (0.5, 0.7, 0.5), "radius": 0.05, "action_scale": MOVES} | options)
+def ball(**options: Any) -> ToolSphere:
+    return ToolSphere(**{"position": (0.5, 0.7, 0.5), "radius": 0.05, "action_scale": MOVES} | options)
 
 
-def stage(*tools: Manipulator, count: int = 2000, dtype: torch.dtype = torch.float64) -> Stage:
+def stage(*tools: Tool, count: int = 2000, dtype: torch.dtype = torch.float64) -> Stage:
     body = BodyBox(position=(0.5, 0.4, 0.5), widths=(0.2, 0.2, 0.2), particle_count=count)
-    scene = Scene(bodies=(body,), manipulators=tools)
+    scene = Scene(bodies=(body,), tools=tools)
     state = initial_state(scene, dtype=dtype)
     priorities = torch.zeros(count, dtype=dtype)
     return Stage(0, scene, state, state.position[0], transport_of(priorities), torch.Generator().manual_seed(0))
 
 
 def distances(stage: Stage, tool: int, position: torch.Tensor) -> torch.Tensor:
-    pose = stage.state.manipulator_pose[0, tool].clone()
+    pose = stage.state.tool_pose[0, tool].clone()
     pose[:3] = position
-    return signed_distance(stage.scene.manipulators[tool], pose, stage.state.position[0])
+    return signed_distance(stage.scene.tools[tool], pose, stage.state.position[0])
 
 
 def lattice(size: int = 9) -> torch.Tensor:
@@ -44,7 +44,7 @@ def lattice(size: int = 9) -> torch.Tensor:
 @pytest.mark.parametrize("clearance", [0.0, 0.02])
 @pytest.mark.parametrize("largest_gap", [float("inf"), 0.03])
 def test_feasible_equals_the_naive_test(clearance: float, largest_gap: float) -> None:
-    turned = ManipulatorBox(
+    turned = ToolBox(
         position=(0.5, 0.7, 0.5),
         half_extents=(0.02, 0.08, 0.05),
         rotation_wxyz=(0.8, 0.0, 0.6, 0.0),
@@ -63,7 +63,7 @@ def test_feasible_equals_the_naive_test(clearance: float, largest_gap: float) ->
 
 
 def test_fixed_tools_are_not_overlapped_from_outside_or_inside() -> None:
-    pillar = ManipulatorCylinder(position=(0.25, 0.5, 0.5), radius=0.15, half_height=0.5)
+    pillar = ToolCylinder(position=(0.25, 0.5, 0.5), radius=0.15, half_height=0.5)
     for radius in (0.02, 0.3):
         here = stage(ball(radius=radius), pillar)
         found = ToolGrid(here, 0, GridOptions()).feasible(lattice(13))
@@ -73,7 +73,7 @@ def test_fixed_tools_are_not_overlapped_from_outside_or_inside() -> None:
 
 
 def test_a_tool_does_not_swallow_a_fixed_one() -> None:
-    pin = ManipulatorSphere(position=(0.275, 0.275, 0.275), radius=0.005)
+    pin = ToolSphere(position=(0.275, 0.275, 0.275), radius=0.005)
     found = ToolGrid(stage(ball(radius=0.12), pin), 0, GridOptions()).feasible(lattice())
     assert float((found - 0.275).norm(dim=-1).min()) >= 0.125 - 1e-3
     assert found.shape[0] > 10
@@ -119,10 +119,10 @@ def test_memory_pieces_do_not_change_the_distances(monkeypatch: pytest.MonkeyPat
 
 
 def test_movable_tools_are_found() -> None:
-    assert movable_manipulators(stage(ball(action_scale=()), ball())) == [1]
-    assert movable_manipulators(stage(ball(), ball())) == [0, 1]
+    assert movable_tools(stage(ball(action_scale=()), ball())) == [1]
+    assert movable_tools(stage(ball(), ball())) == [0, 1]
     with pytest.raises(CapabilityError, match="no movable tool"):
-        movable_manipulators(stage(ball(action_scale=())))
+        movable_tools(stage(ball(action_scale=())))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from torch import Tensor
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate, Stage
 from cpdeform.core.rotation import rotate
-from cpdeform.core.scene import BodyBox, ManipulatorBox, ManipulatorSphere, Scene
+from cpdeform.core.scene import BodyBox, Scene, ToolBox, ToolSphere
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
 from cpdeform.placement.push import PushSearch
@@ -23,15 +23,13 @@ from cpdeform.testing.placer import transport_of
 SCALE = (0.01, 0.01, 0.01)
 
 
-def ball(**changes: Any) -> ManipulatorSphere:
-    return ManipulatorSphere(**{"radius": 0.03, "position": (0.5, 0.3, 0.2), "action_scale": SCALE} | changes)
+def ball(**changes: Any) -> ToolSphere:
+    return ToolSphere(**{"radius": 0.03, "position": (0.5, 0.3, 0.2), "action_scale": SCALE} | changes)
 
 
 def rope(tools: list[Any], *, count: int = 3000) -> Stage:
     """The rope's left part has to go to the front, by at most 0.09, its right part back, by at most 0.06; the middle stays."""
-    scene = Scene(
-        bodies=(BodyBox(position=(0.5, 0.03, 0.5), widths=(0.6, 0.06, 0.06), particle_count=count),), manipulators=tuple(tools)
-    )
+    scene = Scene(bodies=(BodyBox(position=(0.5, 0.03, 0.5), widths=(0.6, 0.06, 0.06), particle_count=count),), tools=tuple(tools))
     state = initial_state(scene, dtype=torch.float64)
     x = state.position[0, :, 0]
     aside = 0.09 * torch.exp(-(((x - 0.34) / 0.07) ** 2)) - 0.06 * torch.exp(-(((x - 0.7) / 0.07) ** 2))
@@ -41,7 +39,7 @@ def rope(tools: list[Any], *, count: int = 3000) -> Stage:
 
 
 def gaps(stage: Stage, poses: Tensor) -> list[float]:
-    tools = zip(stage.scene.manipulators, poses, strict=True)
+    tools = zip(stage.scene.tools, poses, strict=True)
     return [float(signed_distance(tool, pose, stage.state.position[0]).min()) for tool, pose in tools]
 
 
@@ -78,9 +76,7 @@ def test_turning_the_world_turns_the_pushes() -> None:
     everywhere = torch.ones(1000, dtype=torch.bool)
 
     def pushes(points: Tensor, displacements: Tensor) -> list[Any]:
-        search = PushSearch(
-            manipulators=stage.scene.manipulators, particles=points, displacements=displacements, distance_scale=0.03
-        )
+        search = PushSearch(tools=stage.scene.tools, particles=points, displacements=displacements, distance_scale=0.03)
         found = []
         for _ in range(3):
             push = search.next(everywhere)
@@ -135,7 +131,7 @@ def test_a_tool_that_may_not_rise_or_sink_stays_level() -> None:
 
 
 def test_a_plate_presses_its_broad_face() -> None:
-    plate = ManipulatorBox(position=(0.5, 0.4, 0.2), half_extents=(0.01, 0.03, 0.03), rounding=0.005, action_scale=SCALE)
+    plate = ToolBox(position=(0.5, 0.4, 0.2), half_extents=(0.01, 0.03, 0.03), rounding=0.005, action_scale=SCALE)
     stage = rope([plate])
     (placement,) = PlacerTransport(proposers=["push"]).ask(stage)
     thin = rotate(placement.pose[0, 3:7], torch.tensor([1.0, 0.0, 0.0]).to(placement.pose))

@@ -9,7 +9,7 @@ import torch
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate, Proposal, Stage
-from cpdeform.core.scene import BodyBox, BodySphere, ManipulatorSphere, Scene
+from cpdeform.core.scene import BodyBox, BodySphere, Scene, ToolSphere
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
 from cpdeform.placement.random import PlacerRandom, surface_particles
@@ -18,7 +18,7 @@ from cpdeform.placement.random import PlacerRandom, surface_particles
 def stage(seed: int = 0) -> Stage:
     scene = Scene(
         bodies=(BodyBox(position=(0.5, 0.4, 0.5), widths=(0.2, 0.2, 0.2), particle_count=3000),),
-        manipulators=(ManipulatorSphere(position=(0.5, 0.7, 0.5), radius=0.03, action_scale=(0.01, 0.01, 0.01)),),
+        tools=(ToolSphere(position=(0.5, 0.7, 0.5), radius=0.03, action_scale=(0.01, 0.01, 0.01)),),
     )
     state = initial_state(scene)
     return Stage(0, scene, state, state.position[0], None, torch.Generator().manual_seed(seed))
@@ -33,7 +33,7 @@ def test_tools_touch_near_their_particle_without_collision() -> None:
     placements = PlacerRandom(candidates=6).ask(here)
     assert [placement.label for placement in placements] == [f"random-{number}" for number in range(1, 7)]
     for placement in placements:
-        gap = signed_distance(here.scene.manipulators[0], placement.pose[0], here.state.position[0])
+        gap = signed_distance(here.scene.tools[0], placement.pose[0], here.state.position[0])
         assert -1e-6 <= float(gap.min()) <= 5e-4
         assert placement.contact_particle is not None
         assert float(gap[placement.contact_particle]) < 0.02
@@ -82,8 +82,8 @@ def test_surface_of_a_ball_and_of_few_particles() -> None:
 
 def test_gives_up_where_nothing_can_be_touched() -> None:
     here = stage()
-    tool = here.scene.manipulators[0].model_copy(update={"lower_bound": (0.0, 0.8, 0.0)})
-    object.__setattr__(here, "scene", here.scene.model_copy(update={"manipulators": (tool,)}))
+    tool = here.scene.tools[0].model_copy(update={"lower_bound": (0.0, 0.8, 0.0)})
+    object.__setattr__(here, "scene", here.scene.model_copy(update={"tools": (tool,)}))
     assert PlacerRandom(candidates=2, draws=3).ask(here) == []
 
 

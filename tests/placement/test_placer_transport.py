@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.placer import Proposal, Stage
-from cpdeform.core.scene import BodyBox, ManipulatorCapsule, Scene
+from cpdeform.core.scene import BodyBox, Scene, ToolCapsule
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
 from cpdeform.placement.contact_search import score_loss
@@ -33,7 +33,7 @@ def board(count: int = 3000, dtype: torch.dtype = torch.float32, **tool: Any) ->
     pen |= {"radius": 0.03, "height": 0.06, "lower_bound": (0.0, 0.05, 0.0)}
     scene = Scene(
         bodies=(BodyBox(position=(0.5, 0.05, 0.5), widths=(0.3, 0.1, 0.3), particle_count=count),),
-        manipulators=(ManipulatorCapsule(**pen | tool),),
+        tools=(ToolCapsule(**pen | tool),),
     )
     state = initial_state(scene, dtype=dtype)
     priorities = 0.03 * torch.exp(-((along_stroke(state.position[0]) / 0.02) ** 2))
@@ -41,7 +41,7 @@ def board(count: int = 3000, dtype: torch.dtype = torch.float32, **tool: Any) ->
 
 
 def distances(stage: Stage, placement: Proposal) -> Tensor:
-    return signed_distance(stage.scene.manipulators[0], placement.pose[0], stage.state.position[0])
+    return signed_distance(stage.scene.tools[0], placement.pose[0], stage.state.position[0])
 
 
 @pytest.mark.parametrize("count", [3000, 10000])
@@ -55,7 +55,7 @@ def test_pen_lands_on_the_stroke_in_contact(count: int, distance_scale: float) -
     assert -1e-6 <= float(distances(stage, placement).min()) <= 5e-4
     assert placement.contact_particle == int(stage.priorities.argmax())
     assert placement.label == "direct"
-    assert torch.equal(placement.pose[0, 3:], stage.state.manipulator_pose[0, 0, 3:])
+    assert torch.equal(placement.pose[0, 3:], stage.state.tool_pose[0, 0, 3:])
 
 
 def test_score_is_the_papers_formula() -> None:
@@ -74,7 +74,7 @@ def test_no_touching_position_nearby_scores_higher() -> None:
     for _ in range(300):
         pose = placement.pose.clone()
         pose[0, :3] += 0.03 * (torch.rand(3, dtype=torch.float64, generator=generator) - 0.5)
-        gap = signed_distance(stage.scene.manipulators[0], pose[0], stage.state.position[0])
+        gap = signed_distance(stage.scene.tools[0], pose[0], stage.state.position[0])
         if 0.0 <= float(gap.min()) <= 5e-4:
             touching += 1
             assert float((stage.priorities / (gap**2 + 1.0)).mean()) <= placement.score + 1e-8
@@ -118,7 +118,7 @@ def test_is_deterministic_and_leaves_the_state_alone() -> None:
     before = stage.state.clone()
     first, second = PlacerTransport().ask(stage)[0], PlacerTransport().ask(stage)[0]
     assert torch.equal(first.pose, second.pose)
-    assert torch.equal(stage.state.manipulator_pose, before.manipulator_pose)
+    assert torch.equal(stage.state.tool_pose, before.tool_pose)
     assert not first.pose.requires_grad
 
 
@@ -137,7 +137,7 @@ def test_bodies_that_touch_are_ranked_as_one() -> None:
     """A table's leg that has to move comes first, though the mean over the leg's box is below that of the top."""
     leg = BodyBox(position=(0.45, 0.1, 0.5), widths=(0.04, 0.1, 0.04), particle_count=1000)
     top = BodyBox(position=(0.55, 0.17, 0.5), widths=(0.3, 0.04, 0.2), particle_count=1000)
-    scene = Scene(bodies=(leg, top), manipulators=board().scene.manipulators)
+    scene = Scene(bodies=(leg, top), tools=board().scene.tools)
     state = initial_state(scene)
     x, y, _ = state.position[0].unbind(-1)
     tip = (x < 0.45) & (y < 0.08)

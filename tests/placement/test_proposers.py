@@ -27,7 +27,7 @@ def test_variations_are_near_and_free_of_collision() -> None:
     assert 10 < len(varied) < 50
     shifts = torch.stack([item.pose[0, :3] - first.pose[0, :3] for item in varied])
     assert 0.004 < float(shifts.std()) < 0.02
-    tool = stage.scene.manipulators[0]
+    tool = stage.scene.tools[0]
     for item in varied:
         assert float(signed_distance(tool, item.pose[0], stage.state.position[0]).min()) >= -1e-4
         assert torch.equal(item.pose[:, 3:], first.pose[:, 3:])

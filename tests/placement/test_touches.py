@@ -33,7 +33,7 @@ def make_stage(*tools: dict, seed: int = 0, steps: int = 10) -> Stage:
     """A block whose right half is to move to the right, and tools above it."""
     body = {"kind": "box", "position": (0.5, 0.35, 0.5), "widths": (0.24, 0.1, 0.2), "particle_count": 1500}
     placed = [{**tool, "position": (0.3 + 0.4 * number, 0.7, 0.5)} for number, tool in enumerate(tools)]
-    scene = Scene.model_validate({"bodies": [body], "manipulators": placed, "ground_height": 0.27})
+    scene = Scene.model_validate({"bodies": [body], "tools": placed, "ground_height": 0.27})
     state = initial_state(scene)
     right = state.position[0, :, :1] > 0.5
     displacements = torch.where(right, SHIFT, torch.zeros(3))
@@ -60,7 +60,7 @@ def test_tools_begin_free_of_the_clay_and_of_each_other(tools) -> None:
         assert proposal.actions.shape == (10, 3 * len(tools))
         assert float(proposal.actions.abs().max()) <= 1.0
         assert proposal.actions.any()
-        for tool, pose in zip(stage.scene.manipulators, proposal.pose, strict=True):
+        for tool, pose in zip(stage.scene.tools, proposal.pose, strict=True):
             gap = float(signed_distance(tool, pose, particles).min())
             assert gap >= 0.9 * CLEARANCE
             assert float(pose[1]) - float(tool_half_extents(tool, pose[3:7])[1]) >= floor - 1e-5
@@ -90,7 +90,7 @@ def test_tools_move_towards_the_clay_and_back_off_at_the_end() -> None:
     poses, actions = found
     # It stands on the far side of the block and pushes it along; it just does not touch.
     assert float(poses[0, 0]) < 0.36
-    gap = float(signed_distance(stage.scene.manipulators[0], poses[0], room.particles).min())
+    gap = float(signed_distance(stage.scene.tools[0], poses[0], room.particles).min())
     assert CLEARANCE <= gap + 1e-6 < CLEARANCE + LEAST_STEP
     assert torch.allclose(actions[:8, 0], torch.full((8,), 0.04 / 8 / 0.02))
     assert bool((actions[8:, 0] < 0.0).all())
@@ -140,8 +140,8 @@ def test_a_pinch_closes_from_both_sides() -> None:
 def test_blades_face_where_they_push_and_stay_upright() -> None:
     scene = make_stage(BLADE).scene
     direction = torch.tensor([0.6, 0.0, 0.8])
-    broad = facing(scene.manipulators[0], direction, edge=False, roll=0.0)
-    edge = facing(scene.manipulators[0], direction, edge=True, roll=0.0)
+    broad = facing(scene.tools[0], direction, edge=False, roll=0.0)
+    edge = facing(scene.tools[0], direction, edge=True, roll=0.0)
     assert torch.allclose(rotate(broad, torch.tensor([1.0, 0.0, 0.0])), direction, atol=1e-5)
     assert torch.allclose(rotate(edge, torch.tensor([0.0, 0.0, 1.0])), direction, atol=1e-5)
     for rotation in (broad, edge):

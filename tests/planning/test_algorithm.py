@@ -30,7 +30,7 @@ class Diary(Observer):
     def __init__(self):
         self.entries = []
 
-    def run_started(self, task, target, names, seed):
+    def run_started(self, task, goal, names, seed):
         self.entries.append("start")
 
     def iteration_finished(self, stage, iteration):
@@ -57,7 +57,7 @@ def planner(task, *, batch_size=4, simulator=None, solver=None, placer=None, ite
         simulator=simulator,
         ot_solver=solver,
         placer=placer or PlacerToy(),
-        objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene),
+        objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_goal()), scene=task.scene),
         phases=(PhaseDescent(optimizer=optimizer),),
         **options,
     )
@@ -79,7 +79,7 @@ def test_stages_follow_each_other_and_the_best_plan_is_executed(task):
     assert torch.equal(first.actions, first.candidates[0].actions)
     assert first.positions.shape == (6, 60, 3)
     assert torch.equal(first.positions[-1], first.state.position[0])
-    assert torch.equal(first.manipulator_poses[0], first.candidates[0].proposal.pose)
+    assert torch.equal(first.tool_poses[0], first.candidates[0].proposal.pose)
     assert placer.told[0] == [candidate.loss for candidate in first.candidates]
     assert result.gradient_evaluations == 2 * 3 * 3
     assert set(first.seconds) == {"transport", "placement", "optimization", "execution", "total"}
@@ -99,7 +99,7 @@ def test_the_shape_is_judged_after_the_rest(make_toy_task):
 
 
 def test_a_state_that_moves_on_is_not_taken_to_be_at_rest(task):
-    objective = ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), coast_steps=4.0)
+    objective = ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_goal()), coast_steps=4.0)
     state = SimulatorToy(task.scene, batch_size=1).initial_state(batch_size=1)
     losses = [
         float(objective.evaluate(still_trajectory(moving, 5, scene=task.scene)).loss)
@@ -143,7 +143,7 @@ def test_statuses_are_data_with_advice(task):
         stage = result.stages[0]
         assert (result.status, len(result.stages)) == (status, 1)
         assert len(status.advice) > 20
-        assert (stage.best, stage.actions, stage.positions, stage.manipulator_poses) == (None, None, None, None)
+        assert (stage.best, stage.actions, stage.positions, stage.tool_poses) == (None, None, None, None)
         assert torch.equal(stage.state.position, stage.state_before.position)
         assert result.loss_final == result.loss_initial == stage.loss
         assert math.isfinite(result.metric_value)
@@ -217,17 +217,17 @@ def test_capabilities_are_checked_before_any_work(task):
     class Stiff(SimulatorToy):
         capabilities = dataclasses.replace(SimulatorToy.capabilities, differentiable=False)
 
-    tool = task.scene.manipulators[0]
-    still = with_scene(task, manipulators=(tool.model_copy(update={"action_scale": ()}),))
-    two = with_scene(task, manipulators=(tool, tool))
-    inside = with_scene(task, manipulators=(tool.model_copy(update={"position": (0.4, 0.53, 0.4)}),))
+    tool = task.scene.tools[0]
+    still = with_scene(task, tools=(tool.model_copy(update={"action_scale": ()}),))
+    two = with_scene(task, tools=(tool, tool))
+    inside = with_scene(task, tools=(tool.model_copy(update={"position": (0.4, 0.53, 0.4)}),))
     diary = Diary()
     cases = [
         (planner(task, solver=OTSolverExactToy(), observers=(diary,)), CapabilityError, "geomloss"),
         (planner(task, simulator=Stiff(task.scene), observers=(diary,)), CapabilityError, "Stiff has no gradient"),
         (planner(two, observers=(diary,)), CapabilityError, "places at most 1 movable tools, the scene has 2"),
         (planner(still, observers=(diary,)), InputError, "no movable tool"),
-        (planner(inside, observers=(diary,)), InputError, r"scene\.manipulators\.0: got a Sphere that starts 0\.0\d+ length units"),
+        (planner(inside, observers=(diary,)), InputError, r"scene\.tools\.0: got a Sphere that starts 0\.0\d+ length units"),
         (planner(task, simulator=SimulatorToy(two.scene), observers=(diary,)), InputError, "another scene"),
     ]
     for made, error, message in cases:
@@ -285,5 +285,5 @@ def test_deform_by_configuration(toy_task_file, toy_entry_points):
 def test_priorities_may_be_displacements_which_an_exact_solver_has_too(task):
     for solver in (OTSolverToy(), OTSolverExactToy()):
         (stage,) = planner(task, solver=solver, problem=TransportProblem(exponent=2), iterations=2).run(stages=1).stages
-        way = torch.as_tensor(task.load_target()).mean(dim=0) - stage.state_before.position[0].mean(dim=0)
+        way = torch.as_tensor(task.load_goal()).mean(dim=0) - stage.state_before.position[0].mean(dim=0)
         assert torch.allclose(stage.priorities, way.norm().to(stage.priorities))

@@ -51,7 +51,7 @@ class Careful(ObjectiveTransport):
 
 
 def run(task, simulator, *, objective=None, refinement=()):
-    objective: Objective = objective or Careful(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene)
+    objective: Objective = objective or Careful(OTSolverToy(), torch.as_tensor(task.load_goal()), scene=task.scene)
     search = PhaseDescent(optimizer=TrajectoryOptimizer(iterations=3, pruner=PrunerNone()))
     parts = {"ot_solver": OTSolverToy(), "placer": PlacerToy(), "objective": objective, "phases": (search, *refinement)}
     return Planner(task=task, simulator=simulator, **parts).run(stages=1), objective

@@ -48,7 +48,7 @@ class Offset(ObjectiveAutograd):
     def __init__(self, point):
         self.point = point
 
-    def loss(self, positions, manipulator_poses):
+    def loss(self, positions, tool_poses):
         return (positions[:, -1].mean(dim=1) - self.point.to(positions)).square().sum(dim=-1)
 
 
@@ -64,7 +64,7 @@ def planner(task, *, iterations=10, placer=None, simulator=None, phases=(), **op
         simulator=simulator or SimulatorToy(task.scene, batch_size=4),
         ot_solver=OTSolverToy(),
         placer=placer or PlacerToy(),
-        objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene),
+        objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_goal()), scene=task.scene),
         phases=(PhaseDescent(optimizer=optimizer), *phases),
         **options,
     )
@@ -134,7 +134,7 @@ def test_a_simulator_that_cannot_go_on_hides_no_interruption(task):
 
 
 def test_refinement_keeps_what_it_gained(task):
-    point = torch.as_tensor(task.load_target()).mean(dim=0)
+    point = torch.as_tensor(task.load_goal()).mean(dim=0)
     phase = PhaseRefinement(objective=Offset(point), optimizer=TrajectoryOptimizer(iterations=8, learning_rate=0.02))
     plain = planner(task, iterations=2).run(stages=1).stages[0]
     result = interrupted(task, Interrupt(4, phase=REFINEMENT), iterations=2, phases=(phase,))

@@ -17,7 +17,7 @@ class Distance(ObjectiveAutograd):
     def __init__(self, goal):
         self.goal = torch.as_tensor(goal, dtype=torch.float64)
 
-    def loss(self, positions, manipulator_poses):
+    def loss(self, positions, tool_poses):
         return ((positions[:, -1].mean(dim=1) - self.goal) ** 2).sum(dim=-1)
 
 
@@ -123,9 +123,9 @@ class Watching(Distance):
         super().__init__(goal)
         self.asked = []
 
-    def loss(self, positions, manipulator_poses):
+    def loss(self, positions, tool_poses):
         self.asked.append(positions[:, -1].detach().clone())
-        return super().loss(positions, manipulator_poses)
+        return super().loss(positions, tool_poses)
 
 
 def test_the_objective_is_asked_about_the_best_end_where_a_world_breaks(toy_task_file):
@@ -171,9 +171,9 @@ class Remembering(Distance):
         super().__init__(goal)
         self.sizes = []
 
-    def loss(self, positions, manipulator_poses):
+    def loss(self, positions, tool_poses):
         self.sizes.append(len(positions))
-        return super().loss(positions, manipulator_poses)
+        return super().loss(positions, tool_poses)
 
 
 def test_halving_drops_the_worse_half_and_the_winner_is_that_of_the_paper(simulator, state):

@@ -41,7 +41,7 @@ def planner(task, phases, *, placer=None, batch_size=4, **options):
         simulator=SimulatorToy(task.scene, batch_size=batch_size),
         ot_solver=OTSolverToy(),
         placer=placer or PlacerMoving(count=5, spacing=0.01),
-        objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene),
+        objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_goal()), scene=task.scene),
         phases=phases,
         **options,
     )
@@ -77,7 +77,7 @@ def test_first_actions_of_a_proposal_are_where_its_descent_begins(task):
 
 def test_descent_and_refinement_are_refused_alone(task):
     optimizer = TrajectoryOptimizer(iterations=2)
-    objective = ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()))
+    objective = ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_goal()))
     with pytest.raises(InputError, match="phases: got none that works on a round"):
         planner(task, (PhaseRefinement(objective=objective, optimizer=optimizer),)).run()
     with pytest.raises(InputError, match="keep: got 0"):

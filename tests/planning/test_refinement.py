@@ -30,7 +30,7 @@ class Offset(ObjectiveAutograd):
     def __init__(self, point):
         self.point = point
 
-    def loss(self, positions, manipulator_poses):
+    def loss(self, positions, tool_poses):
         return (positions[:, -1].mean(dim=1) - self.point.to(positions)).square().sum(dim=-1)
 
 
@@ -48,7 +48,7 @@ def run(task, point=None, **options):
         simulator=SimulatorToy(task.scene, batch_size=4),
         ot_solver=OTSolverToy(),
         placer=PlacerToy(),
-        objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene),
+        objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_goal()), scene=task.scene),
         phases=(search, *refinement),
         **options,
     )
@@ -56,7 +56,7 @@ def run(task, point=None, **options):
 
 
 def goal(task):
-    return torch.as_tensor(task.load_target()).mean(dim=0)
+    return torch.as_tensor(task.load_goal()).mean(dim=0)
 
 
 def test_a_better_plan_is_executed_and_counted(task):
@@ -81,7 +81,7 @@ def test_a_plan_that_cannot_gain_stays(task):
 
 
 def test_a_plan_worse_than_leaving_the_shape_alone_is_dropped(task):
-    start = torch.as_tensor(task.load_target()).mean(dim=0)
+    start = torch.as_tensor(task.load_goal()).mean(dim=0)
     plain = run(task)
     away = plain.state_before.position[0].mean(dim=0) * 2.0 - start.to(plain.state_before.position)
     refined = run(task, away)
@@ -113,10 +113,10 @@ def test_refinement_by_transport_has_nothing_that_a_task_adds_for_the_search(tas
     optimizer = TrajectoryOptimizer(iterations=ITERATIONS, learning_rate=0.02)
     (stage,) = deform(task, **parts, settings=settings, optimizer=optimizer, stages=1).stages
     refined = [float(iteration.loss[0]) for iteration in stage.history if iteration.phase == REFINEMENT]
-    plain = ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_target()), scene=task.scene)
+    plain = ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_goal()), scene=task.scene)
     start = SimulatorToy(task.scene, batch_size=1)
     found = stage.candidates[stage.best]
-    world = stage.state_before.with_manipulators(found.proposal.pose.unsqueeze(0))
+    world = stage.state_before.with_tools(found.proposal.pose.unsqueeze(0))
     final = float(plain.evaluate(start.rollout(world, stage.actions.unsqueeze(0))).loss[0])
     assert final == pytest.approx(min(refined), rel=1e-5)
     assert final < refined[0]

@@ -10,7 +10,7 @@ import torch
 from cpdeform.core.errors import InputError
 from cpdeform.core.plugins import AUTO, load_registry
 from cpdeform.core.sampling import sample_particles
-from cpdeform.core.scene import BodyBox, ManipulatorCylinder, ManipulatorSphere, Material, Scene
+from cpdeform.core.scene import BodyBox, Material, Scene, ToolCylinder, ToolSphere
 from cpdeform.planning.rest import rest, rest_scene, rest_state, settle_goal, tools_away
 from cpdeform.planning.shape_metrics import GoalShape
 
@@ -20,7 +20,7 @@ FLOOR = 3 / 64
 
 def make_scene(*, height=FLOOR + 0.02, count=800, tools=(), yield_stress=50.0):
     body = BodyBox(position=(0.5, height + 0.04, 0.5), widths=(0.1, 0.08, 0.1), particle_count=count)
-    return Scene(bodies=(body,), manipulators=tools, material=Material(yield_stress=yield_stress))
+    return Scene(bodies=(body,), tools=tools, material=Material(yield_stress=yield_stress))
 
 
 def make_simulator(scene, **options):
@@ -28,8 +28,8 @@ def make_simulator(scene, **options):
     return registry.create("simulator", registry.resolve("simulator", AUTO, device="cpu"), scene=scene, **options)
 
 
-BALL = ManipulatorSphere(radius=0.03, position=(0.5, 0.1, 0.5), action_scale=(0.01, 0.01, 0.01))
-POST = ManipulatorCylinder(radius=0.02, half_height=0.1, position=(0.2, 0.1, 0.2))
+BALL = ToolSphere(radius=0.03, position=(0.5, 0.1, 0.5), action_scale=(0.01, 0.01, 0.01))
+POST = ToolCylinder(radius=0.02, half_height=0.1, position=(0.2, 0.1, 0.2))
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_a_crumb_falls_to_the_floor_while_the_body_rests():
 def test_tools_are_away_and_put_back():
     scene = make_scene(height=FLOOR, tools=(BALL, POST))
     bare = rest_scene(scene)
-    assert [tool.kind for tool in bare.manipulators] == ["Cylinder"]
+    assert [tool.kind for tool in bare.tools] == ["Cylinder"]
     simulator = make_simulator(scene)
     start = simulator.initial_state()  # the ball is inside the clay
     found, alone = (
@@ -97,14 +97,14 @@ def test_tools_are_away_and_put_back():
         rest(make_simulator(bare), rest_state(start, scene), step_limit=20),
     )
     torch.testing.assert_close(found.state.position, alone.state.position, rtol=0.0, atol=1e-6)
-    assert torch.equal(found.state.manipulator_pose, start.manipulator_pose)
-    assert torch.equal(tools_away(start, scene)[:, 1], start.manipulator_pose[:, 1])
+    assert torch.equal(found.state.tool_pose, start.tool_pose)
+    assert torch.equal(tools_away(start, scene)[:, 1], start.tool_pose[:, 1])
     # A tool that cannot rise goes to a corner of its bounds.
     low = BALL.model_copy(update={"lower_bound": (0.1, 0.05, 0.1), "upper_bound": (0.9, 0.06, 0.9)})
     pose = tools_away(start, make_scene(height=FLOOR, tools=(low, POST)))[0, 0]
     assert pose[:3].tolist() == pytest.approx([0.1, 0.06, 0.1])
     stuck = BALL.model_copy(update={"lower_bound": (0.48, 0.08, 0.48), "upper_bound": (0.52, 0.1, 0.52)})
-    with pytest.raises(InputError, match=r"state: manipulators\.0: got clay within 0\.02 of every corner.*rest_scene"):
+    with pytest.raises(InputError, match=r"state: tools\.0: got clay within 0\.02 of every corner.*rest_scene"):
         tools_away(start, make_scene(height=FLOOR, tools=(stuck, POST)))
 
 
@@ -125,17 +125,17 @@ def test_worlds_rest_each_for_itself():
 
 def test_a_goal_is_put_down_rigidly():
     scene = make_scene(height=FLOOR + 0.03)
-    target = torch.as_tensor(sample_particles(scene))
-    goal = settle_goal(make_simulator(rest_scene(scene)), target, stray_share=0.01)
-    assert goal.rests
-    assert goal.drop == pytest.approx(0.03, abs=0.004)
-    expected = target - torch.tensor([0.0, goal.drop, 0.0], dtype=torch.float64)
-    torch.testing.assert_close(goal.position, expected, rtol=0.0, atol=1e-12)
-    assert float((goal.let_go - goal.position)[:, 1].mean()) == pytest.approx(0.0, abs=1e-6)
-    assert goal.self_iou > 0.93
+    goal = torch.as_tensor(sample_particles(scene))
+    put_down = settle_goal(make_simulator(rest_scene(scene)), goal, stray_share=0.01)
+    assert put_down.rests
+    assert put_down.drop == pytest.approx(0.03, abs=0.004)
+    expected = goal - torch.tensor([0.0, put_down.drop, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(put_down.position, expected, rtol=0.0, atol=1e-12)
+    assert float((put_down.let_go - put_down.position)[:, 1].mean()) == pytest.approx(0.0, abs=1e-6)
+    assert put_down.self_iou > 0.93
     # Two slabs with a gap between them are no shape that clay keeps.
-    apart = target + torch.tensor([0.0, 0.06, 0.0]) * (target[:, 1:2] > target[:, 1].median())
-    assert settle_goal(make_simulator(rest_scene(scene)), apart, stray_share=0.01).self_iou < goal.self_iou - 0.2
+    apart = goal + torch.tensor([0.0, 0.06, 0.0]) * (goal[:, 1:2] > goal[:, 1].median())
+    assert settle_goal(make_simulator(rest_scene(scene)), apart, stray_share=0.01).self_iou < put_down.self_iou - 0.2
 
 
 def test_particles_are_shared_out_among_bodies():
@@ -159,7 +159,7 @@ def test_unusable_options_are_refused(option):
 
 def test_a_goal_of_another_size_is_refused():
     simulator = make_simulator(make_scene(count=10))
-    with pytest.raises(InputError, match=r"target: got shape \(4, 3\).*particle_count=len\(target\)"):
+    with pytest.raises(InputError, match=r"goal: got shape \(4, 3\).*particle_count=len\(goal\)"):
         settle_goal(simulator, torch.full((4, 3), 0.5))
 
 

@@ -48,9 +48,9 @@ def block(lower, counts):
 
 def test_a_lattice_fills_its_own_nodes(scene):
     counts = (16, 17, 20)  # large enough for most nodes to be inside
-    goal = GoalShape(lattice((10, 20, 30), counts), scene)
-    assert goal.usual_mass == pytest.approx(1.0 / (16 * 17 * 20))
-    np.testing.assert_array_equal(goal.cells, block((10, 20, 30), counts))
+    shape = GoalShape(lattice((10, 20, 30), counts), scene)
+    assert shape.usual_mass == pytest.approx(1.0 / (16 * 17 * 20))
+    np.testing.assert_array_equal(shape.cells, block((10, 20, 30), counts))
 
 
 def test_usual_mass_is_the_median_above_a_fifth_of_the_largest():
@@ -65,8 +65,8 @@ def test_boxes_shifted_by_whole_cells(scene, axis, shift):
     counts = (8, 9, 12)
     offset = torch.zeros(3, dtype=torch.float64)
     offset[axis] = shift / SIZE
-    target = lattice((10, 20, 30), counts)
-    figures = GoalShape(target, scene).figures(start=target + 0.3, final=target + offset)
+    goal = lattice((10, 20, 30), counts)
+    figures = GoalShape(goal, scene).figures(start=goal + 0.3, final=goal + offset)
     expected = (counts[axis] - shift) / (counts[axis] + shift)
     assert figures.shape_iou_start == 0.0
     assert figures.shape_iou_final == pytest.approx(expected, abs=1e-12)
@@ -77,20 +77,20 @@ def test_boxes_shifted_by_whole_cells(scene, axis, shift):
 
 
 def test_normalised_iou_counts_from_the_start(scene):
-    target = lattice((10, 20, 30), (8, 8, 8))
-    goal = GoalShape(target, scene)
-    start, final = (target + torch.tensor([shift / SIZE, 0.0, 0.0], dtype=torch.float64) for shift in (4, 2))
-    figures = goal.figures(start=start, final=final)
-    expected = (6 / 10 - 4 / 12) / (goal.iou_ceiling - 4 / 12)
+    goal = lattice((10, 20, 30), (8, 8, 8))
+    shape = GoalShape(goal, scene)
+    start, final = (goal + torch.tensor([shift / SIZE, 0.0, 0.0], dtype=torch.float64) for shift in (4, 2))
+    figures = shape.figures(start=start, final=final)
+    expected = (6 / 10 - 4 / 12) / (shape.iou_ceiling - 4 / 12)
     assert figures.normalised_shape_iou == pytest.approx(expected)
-    assert goal.figures(start=target, final=target).normalised_shape_iou is None  # the start is above the ceiling
+    assert shape.figures(start=goal, final=goal).normalised_shape_iou is None  # the start is above the ceiling
 
 
 def test_identical_clouds(scene):
     generator = torch.Generator().manual_seed(3)
-    target = 0.3 + 0.2 * torch.rand(4000, 3, generator=generator, dtype=torch.float64)
-    goal = GoalShape(target, scene)
-    figures = goal.figures(start=target, final=target)
+    goal = 0.3 + 0.2 * torch.rand(4000, 3, generator=generator, dtype=torch.float64)
+    shape = GoalShape(goal, scene)
+    figures = shape.figures(start=goal, final=goal)
     assert (figures.shape_iou_final, figures.silhouette_iou) == (1.0, (1.0, 1.0, 1.0))
     assert (figures.distance_95_result_to_goal, figures.distance_95_goal_to_result) == (0.0, 0.0)
     assert figures.loose_share == 0.0  # a goal of random particles is its own sample
@@ -99,28 +99,28 @@ def test_identical_clouds(scene):
 
 def test_order_and_number_of_particles_do_not_count(scene):
     generator = torch.Generator().manual_seed(4)
-    target, final = (0.3 + 0.2 * torch.rand(3000, 3, generator=generator, dtype=torch.float64) for _ in range(2))
-    goal = GoalShape(target, scene)
+    goal, final = (0.3 + 0.2 * torch.rand(3000, 3, generator=generator, dtype=torch.float64) for _ in range(2))
+    shape = GoalShape(goal, scene)
     order = torch.randperm(3000, generator=generator)
-    assert goal.figures(start=target, final=final) == goal.figures(start=target, final=final[order])
+    assert shape.figures(start=goal, final=final) == shape.figures(start=goal, final=final[order])
     # The same cloud twice has twice the particles and the same shares of mass.
     twice = torch.cat([final, final])
-    assert goal.iou(twice) == goal.iou(final)
-    assert goal.raw_loose_share(twice) == pytest.approx(goal.raw_loose_share(final), abs=1e-12)
+    assert shape.iou(twice) == shape.iou(final)
+    assert shape.raw_loose_share(twice) == pytest.approx(shape.raw_loose_share(final), abs=1e-12)
 
 
 def test_loose_particles_are_counted(scene):
-    target = lattice((10, 20, 30), (10, 10, 10))
-    goal = GoalShape(target, scene)
-    result = target.clone()
+    goal = lattice((10, 20, 30), (10, 10, 10))
+    shape = GoalShape(goal, scene)
+    result = goal.clone()
     # Crumbs, each far from all others: a particle in the middle of a cell gives it 27/64 of its mass, below half of the usual.
     crumbs = [number for number in range(40) if number % 10 not in (0, 9)]
     for place, number in enumerate(crumbs):
         result[number + 400] = torch.tensor([40 + 4 * (place % 4), 8 + 4 * (place // 4), 10], dtype=torch.float64) / SIZE
-    assert goal.raw_loose_share(target) == 0.0
-    assert goal.raw_loose_share(result) == pytest.approx(len(crumbs) / 1000)
-    figures = goal.figures(start=target, final=result)
-    assert figures.loose_share == pytest.approx(len(crumbs) / 1000 - goal.loose_floor)
+    assert shape.raw_loose_share(goal) == 0.0
+    assert shape.raw_loose_share(result) == pytest.approx(len(crumbs) / 1000)
+    figures = shape.figures(start=goal, final=result)
+    assert figures.loose_share == pytest.approx(len(crumbs) / 1000 - shape.loose_floor)
 
 
 def test_surface_cells_are_those_with_an_empty_neighbour():
@@ -146,17 +146,17 @@ def test_surface_distance_in_cells():
 
 
 def test_missing_and_superfluous_clay_tell_apart(scene):
-    target = lattice((10, 20, 10), (20, 6, 20))
-    half = target[target[:, 0] < 20 / SIZE]
-    figures = GoalShape(target, scene).figures(start=target, final=half)
+    goal = lattice((10, 20, 10), (20, 6, 20))
+    half = goal[goal[:, 0] < 20 / SIZE]
+    figures = GoalShape(goal, scene).figures(start=goal, final=half)
     assert figures.distance_95_goal_to_result > 8.0
-    assert figures.distance_95_result_to_goal < 4.0  # the cut face lies inside the goal, at most half its height from a surface
+    assert figures.distance_95_result_to_goal < 4.0  # the cut face lies inside the shape, at most half its height from a surface
 
 
 def test_a_cloud_spread_thin_fills_nothing(scene):
-    target = lattice((10, 20, 30), (8, 8, 8))
+    goal = lattice((10, 20, 30), (8, 8, 8))
     thin = torch.as_tensor(np.random.default_rng(0).uniform(0.05, 0.9, (512, 3)))
-    figures = GoalShape(target, scene).figures(start=target, final=thin)
+    figures = GoalShape(goal, scene).figures(start=goal, final=thin)
     assert figures.shape_iou_final < 0.01
     assert figures.loose_share > 0.9
     empty = np.zeros((8, 8, 8), dtype=bool)
@@ -166,49 +166,49 @@ def test_a_cloud_spread_thin_fills_nothing(scene):
 
 @pytest.fixture(scope="module")
 def star():
-    """The task's scene and goal, and three fresh random samples of its solid."""
+    """The task's scene and shape, and three fresh random samples of its solid."""
     task = load_task("star")
     solid = sculptures.star().fitted_to(sum(body_volume(body) for body in task.scene.bodies))
     lower, upper = solid.corners
     points = lower + np.random.default_rng(5).random((90000, 3)) * (upper - lower)
     inside = torch.as_tensor(points[solid.contains(points)])
-    return task.scene, torch.as_tensor(task.load_target()), list(inside[:30000].split(10000))
+    return task.scene, torch.as_tensor(task.load_goal()), list(inside[:30000].split(10000))
 
 
 def test_the_ceiling_of_an_even_goal_is_that_of_fresh_samples(star):
-    scene, target, samples = star
-    goal = GoalShape(target, scene)
-    measured = np.mean([goal.iou(sample) for sample in samples])
+    scene, goal, samples = star
+    shape = GoalShape(goal, scene)
+    measured = np.mean([shape.iou(sample) for sample in samples])
     assert measured == pytest.approx(0.91, abs=0.015)
-    assert goal.iou_ceiling == pytest.approx(measured, abs=0.015)
-    loose = np.mean([goal.raw_loose_share(sample) for sample in samples])
-    assert goal.loose_floor == pytest.approx(loose, abs=0.012)
+    assert shape.iou_ceiling == pytest.approx(measured, abs=0.015)
+    loose = np.mean([shape.raw_loose_share(sample) for sample in samples])
+    assert shape.loose_floor == pytest.approx(loose, abs=0.012)
 
 
 def test_the_ceiling_of_a_random_goal_is_that_of_fresh_samples(star):
-    scene, _, (target, *samples) = star
+    scene, _, (goal, *samples) = star
     for size in (10000, 4000):
-        goal = GoalShape(target, scene, sample_size=size)
-        measured = np.mean([goal.iou(sample[:size]) for sample in samples])
-        assert goal.iou_ceiling == pytest.approx(measured, abs=0.03)
+        shape = GoalShape(goal, scene, sample_size=size)
+        measured = np.mean([shape.iou(sample[:size]) for sample in samples])
+        assert shape.iou_ceiling == pytest.approx(measured, abs=0.03)
 
 
 def test_the_ceiling_is_repeatable(scene):
-    target = 0.3 + 0.1 * torch.as_tensor(np.random.default_rng(6).random((500, 3)))
-    assert GoalShape(target, scene, seed=7).iou_ceiling == GoalShape(target, scene, seed=7).iou_ceiling
-    assert GoalShape(target, scene, seed=8).iou_ceiling != GoalShape(target, scene, seed=7).iou_ceiling
-    assert math.isnan(GoalShape(target[:5], scene).iou_ceiling)
+    goal = 0.3 + 0.1 * torch.as_tensor(np.random.default_rng(6).random((500, 3)))
+    assert GoalShape(goal, scene, seed=7).iou_ceiling == GoalShape(goal, scene, seed=7).iou_ceiling
+    assert GoalShape(goal, scene, seed=8).iou_ceiling != GoalShape(goal, scene, seed=7).iou_ceiling
+    assert math.isnan(GoalShape(goal[:5], scene).iou_ceiling)
 
 
 @pytest.mark.parametrize(
-    ("target", "options", "match"),
+    ("goal", "options", "match"),
     [
-        (torch.zeros(0, 3), {}, r"target: got shape \(0, 3\), expected shape \(M, 3\)"),
-        (torch.zeros(4, 2), {}, "target: got shape"),
+        (torch.zeros(0, 3), {}, r"goal: got shape \(0, 3\), expected shape \(M, 3\)"),
+        (torch.zeros(4, 2), {}, "goal: got shape"),
         (torch.full((4, 3), 1.5), {}, "4 particles outside the domain"),
         (torch.full((4, 3), 0.5), {"sample_size": 0}, "sample_size: got 0"),
     ],
 )
-def test_unusable_goals_are_refused(scene, target, options, match):
+def test_unusable_goals_are_refused(scene, goal, options, match):
     with pytest.raises(InputError, match=match):
-        GoalShape(target, scene, **options)
+        GoalShape(goal, scene, **options)

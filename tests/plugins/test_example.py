@@ -30,7 +30,7 @@ SimulatorExample: type[Simulator] = importlib.import_module("cpdeform_example.si
 
 TILTED = (0.8, 0.36, 0.36, math.sqrt(1.0 - 0.64 - 2 * 0.36**2))
 LYING = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
-FIELDS = ("position", "velocity", "affine", "elastic_strain", "manipulator_pose")
+FIELDS = ("position", "velocity", "affine", "elastic_strain", "tool_pose")
 TOOLS: dict[str, dict[str, Any]] = {
     "Sphere": {"radius": 0.04, "position": (0.5, 0.14, 0.5)},
     "Capsule": {"radius": 0.03, "height": 0.06, "position": (0.47, 0.14, 0.5)},
@@ -60,7 +60,7 @@ def tool(kind: str, **changes: Any) -> dict[str, Any]:
 
 def scene(*tools: dict[str, Any], **changes: Any) -> Scene:
     body = {"kind": "box", "position": (0.5, 0.07, 0.5), "widths": (0.12, 0.1, 0.12), "particle_count": 100}
-    return Scene.model_validate({"bodies": [body], "manipulators": tools, "grid_size": 32, "substeps": 4, **changes})
+    return Scene.model_validate({"bodies": [body], "tools": tools, "grid_size": 32, "substeps": 4, **changes})
 
 
 SOFT_BALL = {
@@ -111,7 +111,7 @@ def outcome(
     start = simulator.initial_state() if rest else start_of(simulator, seed)
     actions = torch.empty(batch_size, 2, scene.action_size, dtype=torch.float64).uniform_(-1.0, 1.0, generator=generator)
     trajectory = simulator.rollout(start, actions)
-    grads = noise(trajectory.positions, generator), noise(trajectory.manipulator_poses, generator)
+    grads = noise(trajectory.positions, generator), noise(trajectory.tool_poses, generator)
     return trajectory, simulator.vjp(trajectory, *grads)
 
 
@@ -119,7 +119,7 @@ def compare(scene: Scene, *, batch_size: int = 2, seed: int = 0, rest: bool = Fa
     run = functools.partial(outcome, scene=scene, batch_size=batch_size, seed=seed, rest=rest)
     (expected, slope), (found, own) = run(SimulatorWarp), run(SimulatorExample)
     assert float((expected.positions - found.positions).abs().max()) < 1e-12
-    bounds = {"position": 1e-12, "velocity": 1e-9, "affine": 1e-7, "elastic_strain": 1e-10, "manipulator_pose": 1e-12}
+    bounds = {"position": 1e-12, "velocity": 1e-9, "affine": 1e-7, "elastic_strain": 1e-10, "tool_pose": 1e-12}
     for name, bound in bounds.items():
         error = getattr(expected.final_state, name) - getattr(found.final_state, name)
         assert float(error.abs().sum()) == 0.0 or float(error.abs().max()) < bound, name

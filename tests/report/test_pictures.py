@@ -11,12 +11,12 @@ import torch
 from cpdeform.core.errors import InputError
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.scene import (
-    ManipulatorBox,
-    ManipulatorCapsule,
-    ManipulatorChopsticks,
-    ManipulatorCylinder,
-    ManipulatorSphere,
-    ManipulatorTorus,
+    ToolBox,
+    ToolCapsule,
+    ToolChopsticks,
+    ToolCylinder,
+    ToolSphere,
+    ToolTorus,
 )
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.planning.optimizer import TrajectoryOptimizer
@@ -29,13 +29,13 @@ from cpdeform.run.deform import deform
 from cpdeform.run.record import RunRecorder, load_record
 
 TOOLS = [
-    ManipulatorSphere(position=(0, 0, 0), radius=0.1),
-    ManipulatorCapsule(position=(0, 0, 0), radius=0.05, height=0.2),
-    ManipulatorBox(position=(0, 0, 0), half_extents=(0.1, 0.05, 0.2)),
-    ManipulatorBox(position=(0, 0, 0), half_extents=(0.1, 0.05, 0.2), rounding=0.02),
-    ManipulatorCylinder(position=(0, 0, 0), radius=0.1, half_height=0.05),
-    ManipulatorTorus(position=(0, 0, 0), major_radius=0.1, tube_radius=0.03),
-    ManipulatorChopsticks(position=(0, 0, 0), radius=0.03, height=0.2, gap=0.1),
+    ToolSphere(position=(0, 0, 0), radius=0.1),
+    ToolCapsule(position=(0, 0, 0), radius=0.05, height=0.2),
+    ToolBox(position=(0, 0, 0), half_extents=(0.1, 0.05, 0.2)),
+    ToolBox(position=(0, 0, 0), half_extents=(0.1, 0.05, 0.2), rounding=0.02),
+    ToolCylinder(position=(0, 0, 0), radius=0.1, half_height=0.05),
+    ToolTorus(position=(0, 0, 0), major_radius=0.1, tube_radius=0.03),
+    ToolChopsticks(position=(0, 0, 0), radius=0.03, height=0.2, gap=0.1),
 ]
 
 
@@ -69,15 +69,15 @@ def test_tool_surfaces_are_the_tools(tool):
 
 def volume(tool):
     match tool:
-        case ManipulatorSphere():
+        case ToolSphere():
             return 4 / 3 * np.pi * tool.radius**3
-        case ManipulatorCapsule():
+        case ToolCapsule():
             return 4 / 3 * np.pi * tool.radius**3 + np.pi * tool.radius**2 * tool.height
-        case ManipulatorChopsticks():
+        case ToolChopsticks():
             return 2 * (4 / 3 * np.pi * tool.radius**3 + np.pi * tool.radius**2 * tool.height)
-        case ManipulatorCylinder():
+        case ToolCylinder():
             return np.pi * tool.radius**2 * 2 * tool.half_height
-        case ManipulatorTorus():
+        case ToolTorus():
             return 2 * np.pi**2 * tool.major_radius * tool.tube_radius**2
     x, y, z = (2 * half for half in tool.half_extents)
     r = tool.rounding
@@ -129,7 +129,7 @@ def test_picture_and_animation(record):
 
 def test_pictures_come_from_the_record_alone(record, toy_task_file):
     directory = record(stages=1)
-    (toy_task_file.parent / "target.npz").unlink()
+    (toy_task_file.parent / "goal.npz").unlink()
     toy_task_file.unlink()
     moved = directory.rename(directory.with_name("moved"))
     assert draw_picture(load_record(moved)) == moved / "picture.png"

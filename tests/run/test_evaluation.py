@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.goal import load_correspondence, load_goal, load_goal_grid, write_goal
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.sampling import sample_particles
-from cpdeform.core.target import load_correspondence, load_target, load_target_grid, write_target
 from cpdeform.core.task import load_task
 from cpdeform.planning.metrics import evaluate_metric, metric_solver, wasserstein
 from cpdeform.planning.objectives.mass import mass_grid
@@ -34,7 +34,7 @@ def task(toy_task_file):
 def clouds(task):
     """Start, half of the way, and goal."""
     start = torch.as_tensor(sample_particles(task.scene))
-    return start, start + torch.tensor([0.05, 0.0, 0.0]), torch.as_tensor(task.load_target())
+    return start, start + torch.tensor([0.05, 0.0, 0.0]), torch.as_tensor(task.load_goal())
 
 
 def random_clouds(*, count=700, other=500):
@@ -68,8 +68,8 @@ def test_the_streamed_schedule_is_geomloss(monkeypatch, blur, debias):
 @needs_geomloss
 @needs_pot
 def test_all_distances(task, clouds):
-    start, middle, target = clouds
-    result = evaluate(task, start=start, final=middle, target=target, paper=True, exact=True)
+    start, middle, goal = clouds
+    result = evaluate(task, start=start, final=middle, goal=goal, paper=True, exact=True)
     # A cloud and its copy, shifted, are as far apart as the shift.
     assert (result.exact_start, result.exact_final) == pytest.approx((0.1, 0.05), rel=1e-6)
     assert result.exact_method == "ot.emd2"
@@ -78,11 +78,11 @@ def test_all_distances(task, clouds):
     assert result.paper_blur == 1e-5  # the task is one of two stages
     assert 0.5 < result.paper_final / result.exact_final < 1.0
     assert 0.5 < result.paper_floor / result.sampling_floor < 1.0
-    assert evaluate(task, start=start, final=middle, target=target, paper=True, paper_blur=1e-3).paper_blur == 1e-3
-    plain = evaluate(task, start=start, final=middle, target=target)
+    assert evaluate(task, start=start, final=middle, goal=goal, paper=True, paper_blur=1e-3).paper_blur == 1e-3
+    plain = evaluate(task, start=start, final=middle, goal=goal)
     assert (plain.paper_start, plain.paper_blur, plain.exact_final, plain.exact_method) == (None, None, None, None)
     assert set(plain.seconds) == {"iou", "wasserstein", "floor"}
-    assert (plain.particle_count, plain.target_count) == (60, 60)
+    assert (plain.particle_count, plain.goal_count) == (60, 60)
 
 
 def test_exact_without_network_simplex(monkeypatch):
@@ -98,61 +98,61 @@ def test_exact_without_network_simplex(monkeypatch):
 def test_sampling_floor_is_the_distance_of_a_random_sample(kind):
     generator, count = torch.Generator().manual_seed(1), 1500
     widths = torch.tensor([0.3, 0.1, 0.3], dtype=torch.float64)
-    sample, target = (torch.rand(count, 3, generator=generator, dtype=torch.float64) * widths for _ in range(2))
+    sample, goal = (torch.rand(count, 3, generator=generator, dtype=torch.float64) * widths for _ in range(2))
     if kind == "even":
         block = Block(lower=(0.0, 0.0, 0.0), upper=(0.3, 0.1, 0.3))
-        target = torch.as_tensor(fill_evenly(Solid(parts=(block,), origin=(0.0, 0.0, 0.0)), count))
+        goal = torch.as_tensor(fill_evenly(Solid(parts=(block,), origin=(0.0, 0.0, 0.0)), count))
     solver = metric_solver()
 
     def distance(first, second):
         return float(wasserstein(first, second, solver=solver).value)
 
-    assert sampling_floor(target, distance=distance) == pytest.approx(distance(sample, target), rel=0.12)
-    assert math.isnan(sampling_floor(target[:1], distance=distance))
+    assert sampling_floor(goal, distance=distance) == pytest.approx(distance(sample, goal), rel=0.12)
+    assert math.isnan(sampling_floor(goal[:1], distance=distance))
 
 
 def test_goals_that_share_the_particles_have_no_floor(task, clouds, tmp_path):
-    start, middle, target = clouds
-    assert evaluate(task, start=start, final=middle, target=target).sampling_floor > 0.0
+    start, middle, goal = clouds
+    assert evaluate(task, start=start, final=middle, goal=goal).sampling_floor > 0.0
     path = tmp_path / "goal.npz"
-    write_target(path, target.numpy(), corresponds=True)
-    changed = task.model_copy(update={"target": path})
-    result = evaluate(changed, start=start, final=middle, target=target)
+    write_goal(path, goal.numpy(), corresponds=True)
+    changed = task.model_copy(update={"goal": path})
+    result = evaluate(changed, start=start, final=middle, goal=goal)
     assert (result.corresponds, result.sampling_floor) == (True, 0.0)
-    write_target(path, target.numpy()[:50], corresponds=True)
-    assert not changed.target_corresponds()
+    write_goal(path, goal.numpy()[:50], corresponds=True)
+    assert not changed.goal_corresponds()
 
 
 def test_iou_uses_the_grid_of_the_goal(task, clouds, tmp_path):
-    start, middle, target = clouds
-    plain = evaluate(task, start=start, final=middle, target=target)
+    start, middle, goal = clouds
+    plain = evaluate(task, start=start, final=middle, goal=goal)
     assert plain.grid == "particles"
-    grid = mass_grid(target + torch.tensor([0.02, 0.0, 0.0]), task.scene)
+    grid = mass_grid(goal + torch.tensor([0.02, 0.0, 0.0]), task.scene)
     path = tmp_path / "goal.npz"
-    write_target(path, target.numpy(), grid=grid.numpy())
-    changed = task.model_copy(update={"target": path, "metric": "incremental_iou"})
-    result = evaluate(changed, start=start, final=middle, target=target)
-    expected = incremental_iou(mass_grid(middle, task.scene), start=mass_grid(start, task.scene), target=grid)
+    write_goal(path, goal.numpy(), grid=grid.numpy())
+    changed = task.model_copy(update={"goal": path, "metric": "incremental_iou"})
+    result = evaluate(changed, start=start, final=middle, goal=goal)
+    expected = incremental_iou(mass_grid(middle, task.scene), start=mass_grid(start, task.scene), goal=grid)
     assert result.grid == "file"
     assert result.incremental_iou == pytest.approx(float(expected), rel=1e-5)
     assert result.incremental_iou != pytest.approx(plain.incremental_iou, rel=1e-2)
-    metric = evaluate_metric(changed, start=start.float(), final=middle.float(), target=target.float())
+    metric = evaluate_metric(changed, start=start.float(), final=middle.float(), goal=goal.float())
     assert (metric.initial, metric.final) == pytest.approx((0.0, result.incremental_iou), rel=1e-4)
 
 
 def test_metric_is_the_converged_distance(task, clouds):
-    start, middle, target = clouds
-    result = evaluate(task, start=start, final=middle, target=target)
-    metric = evaluate_metric(task, start=start, final=middle, target=target)
+    start, middle, goal = clouds
+    result = evaluate(task, start=start, final=middle, goal=goal)
+    metric = evaluate_metric(task, start=start, final=middle, goal=goal)
     assert (metric.initial, metric.final) == (result.wasserstein_start, result.wasserstein_final)
-    still = evaluate_metric(task, start=start, final=start, target=target)
+    still = evaluate_metric(task, start=start, final=start, goal=goal)
     assert still.initial == still.final == metric.initial
 
 
 def test_metric_without_a_solver_is_unknown(task, clouds):
-    start, middle, target = clouds
+    start, middle, goal = clouds
     with pytest.warns(UserWarning, match="metric is not known: .*nothing that is installed"):
-        metric = evaluate_metric(task, start=start, final=middle, target=target, registry=load_registry([]))
+        metric = evaluate_metric(task, start=start, final=middle, goal=goal, registry=load_registry([]))
     assert math.isnan(metric.final)
 
 
@@ -162,14 +162,14 @@ def test_goal_files(task, tmp_path):
     grid[20:30, 5:9, 40] = generator.uniform(1e-5, 1e-3, (10, 4))
     first, second = tmp_path / "first.npz", tmp_path / "second.npz"
     for path in (first, second):
-        write_target(path, position, grid=grid)
+        write_goal(path, position, grid=grid)
     assert first.read_bytes() == second.read_bytes()
-    np.testing.assert_allclose(load_target(first, scene=task.scene), position, atol=2**-17)
-    np.testing.assert_allclose(load_target_grid(first, scene=task.scene), grid, rtol=1e-6)
+    np.testing.assert_allclose(load_goal(first, scene=task.scene), position, atol=2**-17)
+    np.testing.assert_allclose(load_goal_grid(first, scene=task.scene), grid, rtol=1e-6)
     assert not load_correspondence(first)
-    write_target(second, np.full((3, 3), 2**15, dtype=np.uint16))
-    np.testing.assert_array_equal(load_target(second, scene=task.scene), np.full((3, 3), 0.5))
-    assert load_target_grid(second, scene=task.scene) is None
+    write_goal(second, np.full((3, 3), 2**15, dtype=np.uint16))
+    np.testing.assert_array_equal(load_goal(second, scene=task.scene), np.full((3, 3), 0.5))
+    assert load_goal_grid(second, scene=task.scene) is None
 
 
 def test_records(task, clouds, tmp_path):
@@ -181,8 +181,8 @@ def test_records(task, clouds, tmp_path):
 
     path = tmp_path / "goal.npz"
     grid = mass_grid(clouds[2], task.scene).numpy()
-    write_target(path, clouds[2].numpy(), grid=grid, corresponds=True)
-    task = task.model_copy(update={"target": path})
+    write_goal(path, clouds[2].numpy(), grid=grid, corresponds=True)
+    task = task.model_copy(update={"goal": path})
     recorder = RunRecorder(tmp_path / "run")
     result = deform(
         task,

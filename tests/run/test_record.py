@@ -49,10 +49,10 @@ def test_what_is_saved_is_what_is_loaded(tmp_path, run):
     result = run()
     assert result.save(tmp_path / "deep" / "run") == tmp_path / "deep" / "run"
     record = load_record(tmp_path / "deep" / "run")
-    assert sorted(contents(record.directory)) == ["metrics.jsonl", "run.json", "stage-000.h5", "stage-001.h5", "target.h5"]
+    assert sorted(contents(record.directory)) == ["goal.h5", "metrics.jsonl", "run.json", "stage-000.h5", "stage-001.h5"]
     assert (record.status, record.finished_stages) == ("finished", 2)
-    assert record.task == result.task.model_copy(update={"target": record.directory / "target.h5"})
-    assert torch.equal(record.target, result.target)
+    assert record.task == result.task.model_copy(update={"goal": record.directory / "goal.h5"})
+    assert torch.equal(record.goal, result.goal)
     for field in ("loss_initial", "loss_final", "metric_value", "gradient_evaluations", "seconds", "seed"):
         assert record.run[field] == getattr(result, field)
     assert {"python", "torch", "warp-lang", "numpy", "pot", "geomloss", "cpdeform"} <= set(record.run["versions"])
@@ -61,7 +61,7 @@ def test_what_is_saved_is_what_is_loaded(tmp_path, run):
         assert_same_state(saved.state_before, loaded.state_before)
         for field in ("index", "status", "best", "loss_before", "loss", "gradient_evaluations", "seconds"):
             assert getattr(saved, field) == getattr(loaded, field)
-        for field in ("priorities", "actions", "manipulator_poses"):
+        for field in ("priorities", "actions", "tool_poses"):
             assert torch.equal(getattr(saved, field), getattr(loaded, field))
         assert torch.equal(saved.positions.float(), loaded.positions)
         for before, after in zip(saved.candidates, loaded.candidates, strict=True):
@@ -160,7 +160,7 @@ def test_directory_that_is_not_empty(tmp_path, run):
     assert contents(directory) == before
     run(stages=1, observers=[recorder])
     after = contents(directory)
-    assert sorted(after) == ["metrics.jsonl", "notes.txt", "run.json", "stage-000.h5", "target.h5"]
+    assert sorted(after) == ["goal.h5", "metrics.jsonl", "notes.txt", "run.json", "stage-000.h5"]
     assert after["notes.txt"] == b"mine"
 
 
@@ -207,7 +207,7 @@ def test_a_failing_disk_leaves_no_half_file(tmp_path, run, monkeypatch):
     monkeypatch.setattr(Path, "replace", fail)
     with pytest.raises(RecordError, match="No space left on device"):
         run(observers=[RunRecorder(tmp_path / "run")])
-    assert sorted(contents(tmp_path / "run")) == ["metrics.jsonl", "run.json", "target.h5"]
+    assert sorted(contents(tmp_path / "run")) == ["goal.h5", "metrics.jsonl", "run.json"]
 
 
 def test_damaged_records(tmp_path, run):
@@ -242,7 +242,7 @@ def replace_group(file):
     [
         (fill("state/position", float("nan")), r"stage-000\.h5: state/position: got 180 values that are nan"),
         (fill("state_before/velocity", float("nan")), r"state_before/velocity: got 180 values"),
-        (fill("manipulator_poses", float("nan")), r"stage-000\.h5: manipulator_poses: got 48 values"),
+        (fill("tool_poses", float("nan")), r"stage-000\.h5: tool_poses: got 48 values"),
         (fill("state/position", 7.0), r"state/position: got positions from 7 to 7, expected positions in the domain"),
         (fill("placements/contact_particle", 60), "contact_particle: got 60 to 60, expected -1 to 59"),
         (replace_group, "state/position: got|no array of that name"),

@@ -107,23 +107,23 @@ def test_the_papers_proposers_follow_the_number_of_tools(registry) -> None:
 
 
 def test_limits_of_the_tools_give_way_to_the_user_and_to_the_paper(make_toy_task, registry):
-    limits = {"manipulators": {"0": {"action_scale": [0.004, 0.001, 0.004], "lower_bound": [0.0, 0.02, 0.0]}}}
+    limits = {"tools": {"0": {"action_scale": [0.004, 0.001, 0.004], "lower_bound": [0.0, 0.02, 0.0]}}}
     path = make_toy_task(limits=limits)
-    own = load_task(path).scene.manipulators[0]
+    own = load_task(path).scene.tools[0]
 
     def tool(**given):
         found = resolve({"task": str(path), **given}, registry=registry)
         assert found.task.limits == {}
-        return found.task.scene.manipulators[0]
+        return found.task.scene.tools[0]
 
     assert (tool().action_scale, tool().lower_bound) == ((0.004, 0.001, 0.004), (0.0, 0.02, 0.0))
-    mine = tool(scene={"manipulators": {"0": {"action_scale": [0.002, 0.002, 0.002]}}})
+    mine = tool(scene={"tools": {"0": {"action_scale": [0.002, 0.002, 0.002]}}})
     assert (mine.action_scale, mine.lower_bound) == ((0.002, 0.002, 0.002), (0.0, 0.02, 0.0))
     assert tool(strategy="paper") == own
 
 
 def test_a_simulator_given_as_an_object_has_the_scene_that_it_has(make_toy_task, registry):
-    task = load_task(make_toy_task(limits={"manipulators": {"0": {"lower_bound": [0.0, 0.02, 0.0]}}}))
+    task = load_task(make_toy_task(limits={"tools": {"0": {"lower_bound": [0.0, 0.02, 0.0]}}}))
     for scene in (task.scene, resolve({}, task=task, registry=registry).task.scene):
         found = resolve({}, task=task, registry=registry, objects=PartObjects(simulator=SimulatorToy(scene)))
         assert found.task.scene == scene
@@ -153,10 +153,10 @@ def test_every_task_resolves_to_the_same_run_from_everywhere(strategy, registry)
 def recorded(run, directory):
     """A record of a run whose first stage found no plan."""
     state = initial_state(run.task.scene, dtype=torch.float32)
-    target = torch.as_tensor(run.task.load_target()).float()
+    goal = torch.as_tensor(run.task.load_goal()).float()
     recorder = RunRecorder(directory, configuration=run.configuration)
-    recorder.run_started(run.task, target, run.names, run.configuration.seed)
-    nothing = {"best": None, "actions": None, "positions": None, "manipulator_poses": None, "candidates": ()}
+    recorder.run_started(run.task, goal, run.names, run.configuration.seed)
+    nothing = {"best": None, "actions": None, "positions": None, "tool_poses": None, "candidates": ()}
     recorder.stage_finished(
         StageResult(
             index=0,
@@ -182,14 +182,14 @@ def test_every_resumed_run_resolves_to_the_same(registry, tmp_path):
         for other in (resolve({}, record=record, registry=registry), resolve({"task": name}, record=record, registry=registry)):
             stages = {"stages": first.configuration.stages}
             assert other.configuration.model_copy(update=stages) == first.configuration, name
-            assert other.task.model_copy(update={"target": first.task.target}) == first.task, name
+            assert other.task.model_copy(update={"goal": first.task.goal}) == first.task, name
             assert (other.first_stage, len(other.previous)) == (1, 1)
         shutil.rmtree(tmp_path / name)
 
 
 def test_a_resumed_run_resolves_to_the_same(make_toy_task, registry, tmp_path, toy_entry_points):
     """Wherever the record lies now, whatever became of the task's files, and in Python as on the command line."""
-    path = make_toy_task(limits={"manipulators": {"0": {"lower_bound": [0.0, 0.02, 0.0]}}}, stage_count=3)
+    path = make_toy_task(limits={"tools": {"0": {"lower_bound": [0.0, 0.02, 0.0]}}}, stage_count=3)
     toys = load_registry(toy_entry_points)
     settings = {**TOYS, "optimizer": {"iterations": 2}, "seed": 5}
     whole = resolve({"task": str(path), **settings}, registry=toys)
@@ -198,9 +198,9 @@ def test_a_resumed_run_resolves_to_the_same(make_toy_task, registry, tmp_path, t
     half.save(tmp_path / "half")
     shutil.move(tmp_path / "half", tmp_path / "elsewhere")
     path.unlink()
-    (path.parent / "target.npz").unlink()
+    (path.parent / "goal.npz").unlink()
     record = load_record(tmp_path / "elsewhere")
-    assert torch.equal(torch.as_tensor(record.task.load_target()).to(record.target), record.target)
+    assert torch.equal(torch.as_tensor(record.task.load_goal()).to(record.goal), record.goal)
     evaluation = evaluate_record(record)
     assert evaluation.wasserstein_final < evaluation.wasserstein_start
     assert draw_run(record.directory).is_file()
@@ -242,7 +242,7 @@ def test_records_of_the_first_format_are_read(tmp_path, task, toy_entry_points):
     file = Path(tmp_path / "old" / "run.json")
     run = json.loads(file.read_text())
     run["format"] = 1
-    run["task"] |= {"settings": {"optimizer": {"iterations": 9}}, "target": "/nowhere/target.npz"}
+    run["task"] |= {"settings": {"optimizer": {"iterations": 9}}, "goal": "/nowhere/goal.npz"}
     del run["task"]["limits"]
     configuration = run["configuration"]
     del configuration["strategy"], configuration["strategy_options"]

@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 
 from cpdeform.cli.main import app
 from cpdeform.core.errors import InputError, PluginError
+from cpdeform.core.goal import write_goal
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.sampling import sample_particles
 from cpdeform.core.state import initial_state
-from cpdeform.core.target import write_target
 from cpdeform.core.task import load_task
 from cpdeform.experiments.experiment_plan import PlannedRun
 from cpdeform.experiments.experiment_row import read_row
@@ -31,7 +31,7 @@ FLOOR = 3 / 64
 FALL = 0.02
 SCENE = {
     "bodies": [{"kind": "box", "position": [0.4, FLOOR + FALL + 0.04, 0.5], "widths": [0.1, 0.08, 0.1], "particle_count": 800}],
-    "manipulators": [{"kind": "Sphere", "radius": 0.05, "position": [0.4, 0.4, 0.5], "action_scale": [0.02, 0.02, 0.02]}],
+    "tools": [{"kind": "Sphere", "radius": 0.05, "position": [0.4, 0.4, 0.5], "action_scale": [0.02, 0.02, 0.02]}],
 }
 
 
@@ -41,7 +41,7 @@ def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recorded")
     write_toy_task(folder, scene=SCENE, stage_count=1)
     task = load_task(folder / "shift.yaml")
-    write_target(task.target, sample_particles(task.scene) + np.array([0.06, 0.0, 0.0]))
+    write_goal(task.goal, sample_particles(task.scene) + np.array([0.06, 0.0, 0.0]))
     parts = ["--backend", "toy", "--ot", "toy", "--placer", "toy", "--iterations", "3", "--no-pictures"]
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(write_toy_distribution(folder)))
@@ -71,14 +71,14 @@ def test_start_result_and_goal_rest_on_the_floor(recorded, at_rest):
     assert figures.shape_iou_start < figures.shape_iou_final - 0.1
     # A goal at rest against clay in the air: the fall counts as a difference.
     start = initial_state(record.task.scene)
-    mixed = evaluate_shape(record.task.scene, final=start, target=record.target - torch.tensor([0.06, FALL, 0.0]), from_rest=False)
+    mixed = evaluate_shape(record.task.scene, final=start, goal=record.goal - torch.tensor([0.06, FALL, 0.0]), from_rest=False)
     assert mixed.figures.shape_iou_final < 0.75
 
 
 def test_the_start_against_itself_is_at_the_top(recorded):
     task = load_task(recorded / "shift.yaml")
     start = initial_state(task.scene)
-    found = evaluate_shape(task.scene, final=start, target=start.position[0])
+    found = evaluate_shape(task.scene, final=start, goal=start.position[0])
     # The goal is let go from the same place and put down rigidly: what differs is how the block deforms in its fall.
     assert found.figures.shape_iou_final == found.figures.shape_iou_start == found.goal_self_iou > 0.9
     assert found.figures.distance_95_result_to_goal <= 1.0
@@ -131,4 +131,4 @@ def test_without_a_simulator_there_is_no_rest(recorded):
         evaluate_shape_record(record, registry=load_registry([]))
     assert evaluate_shape_record(record, from_rest=False, registry=load_registry([])).figures.shape_iou_final > 0.0
     with pytest.raises(InputError, match="positions: got"):
-        evaluate_shape(record.task.scene, final=record.state, target=record.target + 1.0, from_rest=False)
+        evaluate_shape(record.task.scene, final=record.state, goal=record.goal + 1.0, from_rest=False)

@@ -18,7 +18,7 @@ from cpdeform.cli.main import app
 from cpdeform.core.errors import InputError
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.sampling import sample_particles
-from cpdeform.core.scene import Manipulator, Scene
+from cpdeform.core.scene import Scene, Tool
 from cpdeform.core.task import Task, list_variants, read_task, task_path
 from cpdeform.run.checks.bodies import check_near_bodies, gap
 from cpdeform.run.checks.check import check_task, check_tools, warn_about_tools
@@ -51,11 +51,11 @@ THIN: dict[str, dict[str, Any]] = {
 
 def scene_with(*tools: dict[str, Any], bodies: Any = (BLOCK,), **changes: Any) -> Scene:
     placed = [{"position": (0.5, BETWEEN_NODES, 0.5 + 0.5 / 64), **tool} for tool in tools]
-    return Scene.model_validate({"bodies": list(bodies), "manipulators": placed, **changes})
+    return Scene.model_validate({"bodies": list(bodies), "tools": placed, **changes})
 
 
-def tool_of(kind: str) -> Manipulator:
-    return scene_with({"kind": kind, **TOOLS[kind]}).manipulators[0]
+def tool_of(kind: str) -> Tool:
+    return scene_with({"kind": kind, **TOOLS[kind]}).tools[0]
 
 
 def only(findings: list[Finding]) -> Finding:
@@ -75,7 +75,7 @@ def moved(points: Any, *by: float) -> Any:
 
 def task_with(tmp_path: Path, scene: Scene, goal: Any, **changes: Any) -> Task:
     np.savez(tmp_path / "goal.npz", position=goal)
-    return Task(name="checked", scene=scene, target=tmp_path / "goal.npz", **changes)
+    return Task(name="checked", scene=scene, goal=tmp_path / "goal.npz", **changes)
 
 
 # Tools --------------------------------------------------------------------------------------------------------------------
@@ -114,8 +114,8 @@ def test_a_plate_below_the_limit_lets_clay_fall_through_and_one_above_carries_it
 def test_a_fixed_tool_that_covers_no_node_is_refused(name: str) -> None:
     scene = scene_with(THIN[name])
     finding = only(check_tools(scene))
-    assert (finding.severity, finding.kind, finding.where) == ("error", "tool thickness", "scene.manipulators.0")
-    with pytest.raises(InputError, match=r"scene\.manipulators\.0: got This fixed .* can never be felt.*grid_size"):
+    assert (finding.severity, finding.kind, finding.where) == ("error", "tool thickness", "scene.tools.0")
+    with pytest.raises(InputError, match=r"scene\.tools\.0: got This fixed .* can never be felt.*grid_size"):
         warn_about_tools(scene)
 
 
@@ -125,7 +125,7 @@ def test_a_thin_tool_on_a_node_or_moving_is_warned_of(name: str) -> None:
     moving = scene_with({**THIN[name], "action_scale": (0.01, 0.01, 0.01)})
     for scene in (on_node, moving):
         assert only(check_tools(scene)).severity == "warning"
-        with pytest.warns(UserWarning, match=r"scene\.manipulators\.0: .*0\.004 thick, and clay passes through") as caught:
+        with pytest.warns(UserWarning, match=r"scene\.tools\.0: .*0\.004 thick, and clay passes through") as caught:
             warn_about_tools(scene)
         assert len(caught) == 1
 
@@ -266,7 +266,7 @@ def test_a_goal_out_of_reach_is_told_of(tmp_path: Path) -> None:
     clay = sample_particles(scene_with(ball))
     goal = moved(clay, 0.2, 0.0, 0.0)
     bounded = task_with(tmp_path, scene_with({**ball, "upper_bound": (0.4, 1.0, 1.0)}), goal, step_count=50)
-    assert only(check_goal_reach(bounded, clay, goal)).where == "scene.manipulators"
+    assert only(check_goal_reach(bounded, clay, goal)).where == "scene.tools"
     short = task_with(tmp_path, scene_with(ball), goal, step_count=5)
     assert only(check_goal_reach(short, clay, goal)).where == "step_count"
     assert check_goal_reach(task_with(tmp_path, scene_with(ball), goal, step_count=50), clay, goal) == []
@@ -297,15 +297,15 @@ def test_the_tasks_that_come_with_it_have_no_fault(name: str) -> None:
 def test_the_command_line_tells_all_and_fails(tmp_path: Path) -> None:
     scene = scene_with(THIN["plate"], {"kind": "Sphere", "radius": 0.03, "action_scale": (1.0, 1.0, 1.0)})
     np.savez(tmp_path / "goal.npz", position=moved(sample_particles(scene), 0.0, 0.1, 0.0))
-    content = {"name": "faulty", "scene": scene.model_dump(mode="json"), "target": "goal.npz"}
+    content = {"name": "faulty", "scene": scene.model_dump(mode="json"), "goal": "goal.npz"}
     (tmp_path / "faulty.yaml").write_text(json.dumps(content))
     result = CliRunner().invoke(app, ["task", "check", str(tmp_path / "faulty.yaml"), "--json"])
     *lines, last = result.stdout.splitlines()
     assert result.exit_code == 1
     assert [line.split(": ")[:3] for line in lines] == [
-        ["error", "tool thickness", "scene.manipulators.0"],
-        ["warning", "tool speed", "scene.manipulators.1.action_scale"],
-        ["warning", "goal floating", "target"],
+        ["error", "tool thickness", "scene.tools.0"],
+        ["warning", "tool speed", "scene.tools.1.action_scale"],
+        ["warning", "goal floating", "goal"],
     ]
     found = json.loads(last)
     assert not found["passed"]

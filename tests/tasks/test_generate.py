@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from cpdeform.cli.main import app
 from cpdeform.core.errors import InputError
+from cpdeform.core.goal import load_correspondence, load_goal
 from cpdeform.core.plugins import AUTO, load_registry
 from cpdeform.core.sampling import body_index, sample_particles
-from cpdeform.core.target import load_correspondence, load_target
 from cpdeform.core.task import changed_task, load_task
 from cpdeform.planning.rest import rest_scene, settle_goal
 from cpdeform.tasks.generate.goal import GeneratedGoal, generate_goal
@@ -180,7 +180,7 @@ def test_the_same_seed_gives_the_same_file(tmp_path):
     assert contents[0] == contents[1]
     assert contents[0] != contents[2]
     path = tmp_path / "made" / "0.npz"
-    assert load_target(path, scene=task.scene).shape == (4500, 3)
+    assert load_goal(path, scene=task.scene).shape == (4500, 3)
     assert load_correspondence(path)
     assert [goal.for_reporting for goal in goals] == [False, False, True]
 
@@ -217,7 +217,7 @@ def test_the_command(tmp_path, monkeypatch):
 def test_scenes_without_room_are_refused(monkeypatch):
     with pytest.raises(InputError, match="seed: got -3"):
         generate_goal(load_task("star"), seed=-3)
-    with pytest.raises(InputError, match=r"scene\.manipulators\.0: got a Capsule"):
+    with pytest.raises(InputError, match=r"scene\.tools\.0: got a Capsule"):
         dent_motion(load_task("writer").scene, np.random.default_rng(0))
     tiny = changed_task(load_task("star"), scene={"bodies": {"0": {"widths": [0.05, 0.02, 0.05]}}})
     monkeypatch.setattr("cpdeform.tasks.generate.random_solids.ATTEMPTS", 1)

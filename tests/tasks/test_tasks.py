@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cpdeform.core.errors import UnknownNameError
+from cpdeform.core.goal import load_correspondence
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.sampling import body_index, sample_particles
 from cpdeform.core.state import initial_state
-from cpdeform.core.target import load_correspondence
 from cpdeform.core.task import Task, list_variants, load_task, task_path
 from cpdeform.planning.algorithm import check_tools_outside
 from cpdeform.planning.objectives.metrics import soft_iou
 from cpdeform.planning.objectives.plasticinelab import mass_grid
 from cpdeform.tasks import sculptures
-from cpdeform.tasks.make_targets import MAKERS, SHARE, agreement, chosen, make
+from cpdeform.tasks.make_goals import MAKERS, SHARE, agreement, chosen, make
 from cpdeform.tasks.plugin import TASKS
 from cpdeform.tasks.solids import Solid, body_volume
 
@@ -46,7 +46,7 @@ def names() -> list[str]:
 def loaded(name: str) -> tuple[Task, NDArray[np.float64], NDArray[np.float64]]:
     """A task, its start and its goal."""
     task = load_task(name, registry=REGISTRY)
-    return task, sample_particles(task.scene), task.load_target()
+    return task, sample_particles(task.scene), task.load_goal()
 
 
 def spread(positions: NDArray[np.float64]) -> float:
@@ -58,10 +58,10 @@ def spread(positions: NDArray[np.float64]) -> float:
 def test_seventeen_tasks_and_a_maker_for_each_goal() -> None:
     assert len(BASES) == 17
     assert sorted(MAKERS) == sorted(names())
-    files = [loaded(name)[0].target for name in names()]
+    files = [loaded(name)[0].goal for name in names()]
     assert sorted(path.name for path in files[0].parent.glob("*.npz")) == sorted(path.name for path in files)
     for name in names():
-        assert load_correspondence(loaded(name)[0].target) == MAKERS[name][1]
+        assert load_correspondence(loaded(name)[0].goal) == MAKERS[name][1]
 
 
 @pytest.mark.parametrize("base", BASES)
@@ -82,30 +82,30 @@ def test_multi_stage_tasks_are_judged_by_transport_and_the_others_have_five_vari
 
 @pytest.mark.parametrize("name", names())
 def test_goal_is_of_the_same_clay_and_in_the_domain(name: str) -> None:
-    task, start, target = loaded(name)
-    assert target.shape == start.shape
+    task, start, goal = loaded(name)
+    assert goal.shape == start.shape
     lower, upper = (np.asarray(corner) for corner in task.scene.domain)
-    assert (target >= lower - 1e-4).all()
-    assert (target <= upper + 1e-4).all()
-    assert task.target.stat().st_size < (130_000 if name == "chair" else 80_000)
+    assert (goal >= lower - 1e-4).all()
+    assert (goal <= upper + 1e-4).all()
+    assert task.goal.stat().st_size < (130_000 if name == "chair" else 80_000)
 
 
 @pytest.mark.parametrize("name", names())
 def test_no_particle_was_flung_away(name: str) -> None:
-    task, start, target = loaded(name)
-    alone = cKDTree(target).query(target, k=2)[0][:, 1].max()
+    task, start, goal = loaded(name)
+    alone = cKDTree(goal).query(goal, k=2)[0][:, 1].max()
     assert alone < 2.0 * task.scene.node_distance
-    assert np.linalg.norm(target - start.mean(axis=0), axis=1).max() < 0.55
+    assert np.linalg.norm(goal - start.mean(axis=0), axis=1).max() < 0.55
 
 
 @pytest.mark.parametrize("name", names())
 def test_goal_differs_from_the_start(name: str) -> None:
     """Otherwise the normalised incremental IoU would have no way to go."""
-    task, start, target = loaded(name)
-    grids = [mass_grid(torch.as_tensor(positions), task.scene) for positions in (start, target)]
+    task, start, goal = loaded(name)
+    grids = [mass_grid(torch.as_tensor(positions), task.scene) for positions in (start, goal)]
     assert float(soft_iou(grids[1], grids[1]) - soft_iou(grids[0], grids[1])) > 2e-3
-    if load_correspondence(task.target):
-        moved = np.linalg.norm(target - start, axis=1)
+    if load_correspondence(task.goal):
+        moved = np.linalg.norm(goal - start, axis=1)
         assert moved.max() > 0.04
         assert (moved > 0.01).sum() > 150
 
@@ -141,45 +141,45 @@ def test_solid_has_the_volume_of_the_clay(name: str) -> None:
 
 @pytest.mark.parametrize("name", SOLIDS)
 def test_solid_is_filled_evenly(name: str) -> None:
-    task, start, target = loaded(name)
+    task, start, goal = loaded(name)
     solid: Solid = SOLIDS[name]().fitted_to(sum(body_volume(body) for body in task.scene.bodies))
-    assert solid.contains(target).mean() > 0.999
-    assert spread(target) < 0.4 * spread(start)
+    assert solid.contains(goal).mean() > 0.999
+    assert spread(goal) < 0.4 * spread(start)
     # Every part is filled with as many particles as its volume asks for: boxes of equal numbers of random points.
     lower, upper = solid.corners
     points = np.random.default_rng(2).uniform(lower, upper, (300_000, 3))
     points = points[solid.contains(points)]
     middle = np.median(points, axis=0)
-    shares = [np.bincount((cloud > middle) @ [1, 2, 4], minlength=8) / len(cloud) for cloud in (points, target)]
+    shares = [np.bincount((cloud > middle) @ [1, 2, 4], minlength=8) / len(cloud) for cloud in (points, goal)]
     assert np.abs(shares[0] - shares[1]).max() < 0.01
 
 
 @pytest.mark.parametrize("name", SOLIDS)
 def test_solid_stands_where_the_clay_comes_to_rest(name: str) -> None:
-    task, _, target = loaded(name)
+    task, _, goal = loaded(name)
     backend = REGISTRY.resolve("simulator", "auto", device="cpu")
     simulator = REGISTRY.create("simulator", backend, scene=task.scene, dtype=torch.float32)
     actions = torch.zeros(1, 20, task.scene.action_size)
     rested = simulator.rollout(simulator.initial_state(batch_size=1), actions).final_state.position[0, :, 1].numpy()
-    assert target[:, 1].min() == pytest.approx(np.quantile(rested, 1e-3), abs=0.004)
+    assert goal[:, 1].min() == pytest.approx(np.quantile(rested, 1e-3), abs=0.004)
 
 
 def test_cubes_are_moved_whole_along_the_floor() -> None:
-    task, start, target = loaded("move++")
+    task, start, goal = loaded("move++")
     for body in range(3):
-        shift = (target - start)[body_index(task.scene) == body]
+        shift = (goal - start)[body_index(task.scene) == body]
         assert np.ptp(shift, axis=0).max() < 2e-5
         assert 0.1 < np.linalg.norm(shift[0]) < 0.2
         assert abs(shift[0, 1]) < 2e-5
 
 
 def test_rope_keeps_its_length_and_its_cross_section() -> None:
-    _, start, target = loaded("rope++")
-    ends = [cloud[order] for cloud in (start, target) for order in [np.argsort(start[:, 0])]]
+    _, start, goal = loaded("rope++")
+    ends = [cloud[order] for cloud in (start, goal) for order in [np.argsort(start[:, 0])]]
     chunks = [np.stack([part.mean(axis=0) for part in np.array_split(cloud, 60)]) for cloud in ends]
     length = [np.linalg.norm(np.diff(middle, axis=0), axis=1).sum() for middle in chunks]
     assert length[1] == pytest.approx(length[0], rel=0.02)
-    assert np.abs(target[:, 1] - start[:, 1]).max() < 2e-5
+    assert np.abs(goal[:, 1] - start[:, 1]).max() < 2e-5
     assert np.linalg.norm(chunks[1][-1] - chunks[1][0]) < 0.97 * length[1]
 
 

@@ -1,4 +1,4 @@
-"""The task `writer`: its targets are this project's own, reproducible, and out of reach from the pen's start."""
+"""The task `writer`: its goals are this project's own, reproducible, and out of reach from the pen's start."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import torch
 
 from cpdeform import load_task
 from cpdeform.backends.warp.simulator import SimulatorWarp
+from cpdeform.core.goal import POSITION_SCALE
 from cpdeform.core.sampling import sample_particles
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.core.state import manipulator_pose
-from cpdeform.core.target import POSITION_SCALE
+from cpdeform.core.state import tool_pose
 from cpdeform.core.task import Task
 from cpdeform.planning.objectives.metrics import soft_iou
 from cpdeform.planning.objectives.plasticinelab import mass_grid
@@ -26,17 +26,17 @@ def task(request: pytest.FixtureRequest) -> Task:
 
 
 def displacement(task: Task) -> np.ndarray:
-    return np.linalg.norm(task.load_target() - sample_particles(task.scene), axis=1)
+    return np.linalg.norm(task.load_goal() - sample_particles(task.scene), axis=1)
 
 
-def test_every_variant_has_a_stroke_and_a_target() -> None:
+def test_every_variant_has_a_stroke_and_a_goal() -> None:
     assert [name for name in SINGLE_STAGE if name.startswith("writer-")] == [f"writer-{variant}" for variant in VARIANTS]
-    targets = [load_task(f"writer-{variant}").load_target() for variant in VARIANTS]
-    assert len({target.tobytes() for target in targets}) == len(VARIANTS)
+    goals = [load_task(f"writer-{variant}").load_goal() for variant in VARIANTS]
+    assert len({goal.tobytes() for goal in goals}) == len(VARIANTS)
     assert load_task("writer").name == "writer-v1"
 
 
-def test_target_is_the_board_with_one_local_stroke(task: Task) -> None:
+def test_goal_is_the_board_with_one_local_stroke(task: Task) -> None:
     moved = displacement(task)
     assert moved.max() > 0.02
     assert np.quantile(moved, 0.5) < 0.003
@@ -45,8 +45,8 @@ def test_target_is_the_board_with_one_local_stroke(task: Task) -> None:
 
 def test_pen_starts_outside_the_body_and_beside_the_stroke(task: Task) -> None:
     particles = torch.as_tensor(sample_particles(task.scene))
-    pose = manipulator_pose(task.scene)
-    pen = task.scene.manipulators[0]
+    pose = tool_pose(task.scene)
+    pen = task.scene.tools[0]
     assert float(signed_distance(pen, pose[0], particles).min()) > 0.0
     start = sample_particles(task.scene)
     pressed = start[displacement(task) > 0.02]
@@ -58,12 +58,12 @@ def test_pen_starts_outside_the_body_and_beside_the_stroke(task: Task) -> None:
 def test_goal_is_nearer_to_itself_than_the_start_is(task: Task) -> None:
     """Otherwise the normalised incremental IoU would have no way to go."""
     start = mass_grid(torch.as_tensor(sample_particles(task.scene)), task.scene)
-    goal = mass_grid(torch.as_tensor(task.load_target()), task.scene)
+    goal = mass_grid(torch.as_tensor(task.load_goal()), task.scene)
     assert float(soft_iou(goal, goal) - soft_iou(start, goal)) > 1e-3
 
 
-def test_target_files_are_compact(task: Task) -> None:
-    assert task.target.stat().st_size < 80_000
+def test_goal_files_are_compact(task: Task) -> None:
+    assert task.goal.stat().st_size < 80_000
 
 
 @pytest.mark.slow
@@ -72,6 +72,6 @@ def test_warp_draws_the_stroke_within_a_unit() -> None:
     task = load_task("writer-v1")
     maker, corresponds = SINGLE_STAGE[task.name]
     drawn = maker(task.scene, lambda: SimulatorWarp(task.scene, dtype=torch.float64))
-    difference = np.abs(np.rint(drawn * POSITION_SCALE) - task.load_target() * POSITION_SCALE)
+    difference = np.abs(np.rint(drawn * POSITION_SCALE) - task.load_goal() * POSITION_SCALE)
     assert corresponds
     assert (difference <= 1.0).mean() > 0.999

@@ -23,7 +23,7 @@ from cpdeform.testing import check_golden_file
 
 SCENE = {
     "bodies": [{"kind": "box", "position": [0.5, 0.06, 0.5], "widths": [0.1, 0.1, 0.1], "particle_count": 200}],
-    "manipulators": [{"kind": "Sphere", "radius": 0.03, "position": [0.5, 0.14, 0.5], "action_scale": [0.01, 0.01, 0.01]}],
+    "tools": [{"kind": "Sphere", "radius": 0.03, "position": [0.5, 0.14, 0.5], "action_scale": [0.01, 0.01, 0.01]}],
 }
 
 
@@ -40,7 +40,7 @@ def recorded(tmp_path: Path) -> Path:
     trajectory = simulator.rollout(state, actions)
     grid = mass_grid(state.position[0] + torch.tensor([0.05, 0.0, 0.0]), scene)
     result = ObjectivePlasticineLab(scene, grid).evaluate(trajectory)
-    gradient = simulator.vjp(trajectory, result.grad_positions, result.grad_manipulators).actions[0].numpy().copy()
+    gradient = simulator.vjp(trajectory, result.grad_positions, result.grad_tools).actions[0].numpy().copy()
     gradient[:, 0] = 1e299
     zeros, identity = np.zeros((200, 3, 3)), np.tile(np.eye(3), (200, 1, 1))
     (tmp_path / "golden").mkdir()
@@ -48,12 +48,12 @@ def recorded(tmp_path: Path) -> Path:
     for name in ("torus-v2-seed0", "pinch-v1"):
         np.savez(
             tmp_path / "golden" / f"{name}.npz",
-            x0=state.position[0], v0=state.velocity[0], C0=zeros, F0=identity, prim=trajectory.manipulator_poses[0, :, 0, :7],
+            x0=state.position[0], v0=state.velocity[0], C0=zeros, F0=identity, prim=trajectory.tool_poses[0, :, 0, :7],
             actions=actions[0], x=trajectory.positions[0, -1], v=trajectory.final_state.velocity[0], grad=gradient,
             total_loss=float(result.loss[0]), softness=666.0, n_grid=32, substeps=4, dt=1e-4,
         )  # fmt: skip
     unknown = copy.deepcopy(SCENE)
-    unknown["manipulators"][0]["kind"] = "Spoon"
+    unknown["tools"][0]["kind"] = "Spoon"
     content = {"torus": {**SCENE, "variants": []}, "pinch": unknown}
     (tmp_path / "plasticinelab" / "scenes.json").write_text(json.dumps(content))
     cells = torch.nonzero(grid)

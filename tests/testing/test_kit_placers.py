@@ -24,12 +24,12 @@ def test_registered_placers_pass(name):
 class PlacerHover(Placer):
     """A correct placer, to be broken: the movable tools go as high as they may, where nothing else is."""
 
-    capabilities = PlacerCapabilities(needs_priorities=False, max_manipulators=None)
+    capabilities = PlacerCapabilities(needs_priorities=False, max_tools=None)
     height = 0.2
 
     def pose(self, stage):
-        pose = stage.state.manipulator_pose[0].clone()
-        for index, tool in enumerate(stage.scene.manipulators):
+        pose = stage.state.tool_pose[0].clone()
+        for index, tool in enumerate(stage.scene.tools):
             if tool.movable:
                 pose[index, :3] = torch.tensor([PEAK[0] - 0.02, self.height, PEAK[2]])
                 lower, upper = (torch.tensor(bound).to(pose) for bound in (tool.lower_bound, tool.upper_bound))
@@ -40,7 +40,7 @@ class PlacerHover(Placer):
         pose = self.pose(stage)
         collides = any(
             bool((signed_distance(tool, pose[index], stage.state.position[0]) < 0).any())
-            for index, tool in enumerate(stage.scene.manipulators)
+            for index, tool in enumerate(stage.scene.tools)
         )
         return [] if collides else [Proposal(pose, float("nan"), "hover")]
 
@@ -88,8 +88,8 @@ class PlacerOwnRandomness(PlacerHover):
 
 class PlacerWriting(PlacerHover):
     def pose(self, stage):
-        stage.state.manipulator_pose[0] = super().pose(stage)
-        return stage.state.manipulator_pose[0]
+        stage.state.tool_pose[0] = super().pose(stage)
+        return stage.state.tool_pose[0]
 
 
 class PlacerSecretPriorities(PlacerHover):

@@ -87,11 +87,11 @@ class SimulatorGhosts(SimulatorWarp):
     """Tools pass through the clay."""
 
     def rollout(self, state, actions):
-        away = state.manipulator_pose.clone()
+        away = state.tool_pose.clone()
         away[..., 1] = 0.9
-        there = super().rollout(state.with_manipulators(away), actions)
-        poses = super().rollout(state, actions).manipulator_poses
-        return dataclasses.replace(there, manipulator_poses=poses)
+        there = super().rollout(state.with_tools(away), actions)
+        poses = super().rollout(state, actions).tool_poses
+        return dataclasses.replace(there, tool_poses=poses)
 
 
 class SimulatorShy(SimulatorWarp):
@@ -103,26 +103,26 @@ class SimulatorShy(SimulatorWarp):
 class SimulatorBorrowing(SimulatorWarp):
     """Rolls out anew on the way back, from tensors that the caller may have written to since."""
 
-    def vjp(self, trajectory, grad_positions, grad_manipulators=None, **options):
+    def vjp(self, trajectory, grad_positions, grad_tools=None, **options):
         again = self.rollout(trajectory.initial_state, trajectory.actions)
-        return super().vjp(again, grad_positions, grad_manipulators, **options)
+        return super().vjp(again, grad_positions, grad_tools, **options)
 
 
 class SimulatorOneWay(SimulatorWarp):
     """Written before rollouts could be chained."""
 
-    def vjp(self, trajectory, grad_positions, grad_manipulators=None):
-        return super().vjp(trajectory, grad_positions, grad_manipulators)
+    def vjp(self, trajectory, grad_positions, grad_tools=None):
+        return super().vjp(trajectory, grad_positions, grad_tools)
 
 
 class SimulatorMatrixStrain(SimulatorWarp):
     """Takes the gradient of the final strain as that of the matrix's entries, and gives that of the six numbers."""
 
-    def vjp(self, trajectory, grad_positions, grad_manipulators=None, *, grad_final_state=None):
+    def vjp(self, trajectory, grad_positions, grad_tools=None, *, grad_final_state=None):
         if grad_final_state is not None:
             strain = grad_final_state.elastic_strain * torch.tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
             grad_final_state = dataclasses.replace(grad_final_state, elastic_strain=strain)
-        return super().vjp(trajectory, grad_positions, grad_manipulators, grad_final_state=grad_final_state)
+        return super().vjp(trajectory, grad_positions, grad_tools, grad_final_state=grad_final_state)
 
 
 def jitter(trajectory, simulator, _):
@@ -159,7 +159,7 @@ BROKEN_SIMULATORS = {
     "2T steps are T steps twice": final_with(affine=lambda affine: 0.9 * affine),
     "a batch is a loop over worlds": changed_rollout(mixed_worlds),
     "deterministic where declared": changed_rollout(jitter),
-    "declared manipulator kinds run": SimulatorGhosts,
+    "declared tool kinds run": SimulatorGhosts,
     "capabilities hold": SimulatorLooseDeclarations,
     "bad arguments are named": SimulatorTerse,
     "senseless numbers are refused": SimulatorTrusting,
@@ -178,9 +178,9 @@ BROKEN_SIMULATORS = {
     "volume is nearly kept under a squeeze": SimulatorGhosts,
     **{
         f"gradient of {name}": scaled_gradient(name)
-        for name in ("actions", "position", "velocity", "affine", "elastic_strain", "manipulator_pose")
+        for name in ("actions", "position", "velocity", "affine", "elastic_strain", "tool_pose")
     },
-    "gradient with each manipulator kind": scaled_gradient("actions"),
+    "gradient with each tool kind": scaled_gradient("actions"),
     "gradient of a batch is a loop over worlds": changed_gradient(mixed_gradients),
     "gradient is finite from rest": changed_gradient(infinite_without_actions),
     "gradient is refused where not declared": SimulatorShy,

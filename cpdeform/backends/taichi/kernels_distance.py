@@ -1,4 +1,4 @@
-"""Signed distances of the manipulators in their local frames, outward normals, and the derivative of the normals.
+"""Signed distances of the tools in their local frames, outward normals, and the derivative of the normals.
 
 The entries of a tool's `size`, lengths: Sphere (radius); Capsule, RollingPin and Chopsticks (radius, height); Box (half extents,
 rounding); Cylinder (radius, half height); Torus (major radius, tube radius). Chopsticks are the capsule nearer to a point:
@@ -13,7 +13,7 @@ from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, 
 from cpdeform.backends.taichi.kernels_types import build_types
 from cpdeform.backends.taichi.runtime import ti
 
-MANIPULATOR_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
 """The kinds of tools that the functions below know; the simulator refuses others."""
 
 

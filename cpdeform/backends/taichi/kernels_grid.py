@@ -1,7 +1,7 @@
-"""The grid update: gravity, contact with the manipulators, walls and floor; and its adjoint.
+"""The grid update: gravity, contact with the tools, walls and floor; and its adjoint.
 
-A node's velocity passes through the manipulators in turn, then the walls. The adjoint recomputes a node's velocity before each
-manipulator instead of storing it: contact nodes are few.
+A node's velocity passes through the tools in turn, then the walls. The adjoint recomputes a node's velocity before each
+tool instead of storing it: contact nodes are few.
 """
 
 import functools

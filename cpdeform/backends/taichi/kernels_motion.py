@@ -1,4 +1,4 @@
-"""Motion of the manipulators under actions, and its adjoint: one thread follows one tool through all substeps."""
+"""Motion of the tools under actions, and its adjoint: one thread follows one tool through all substeps."""
 
 import functools
 from types import SimpleNamespace

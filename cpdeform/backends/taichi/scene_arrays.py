@@ -39,7 +39,7 @@ def make_numbers(scene: Scene, *, worlds: int, blocks: int, lanes: int) -> Tenso
 
 
 def make_tools(scene: Scene) -> Tensor:
-    """The manipulators (M, 21), float64; one unused row where there is none."""
+    """The tools (M, 21), float64; one unused row where there is none."""
     rows = [
         [*tool.size, tool.friction, *tool.scale, *tool.lower, *tool.upper, tool.kind, tool.action_offset, tool.action_size]
         for tool in tool_numbers(scene)

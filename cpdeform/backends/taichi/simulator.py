@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.backends.checkpointing import SimulatorCheckpointing
-from cpdeform.backends.taichi.kernels_distance import MANIPULATOR_KINDS
+from cpdeform.backends.taichi.kernels_distance import TOOL_KINDS
 from cpdeform.backends.taichi.kernels_motion import build_motion
 from cpdeform.backends.taichi.kernels_substep import build_substep
 from cpdeform.backends.taichi.kernels_types import AFFINE, POSITION, RECORD_SIZE, STRAIN, VELOCITY
@@ -66,7 +66,7 @@ class SimulatorTaichi(SimulatorCheckpointing):
             one checkpoint per environment step is kept and the inside recomputed.
 
     Raises:
-        CapabilityError: The device, type or a manipulator is not supported.
+        CapabilityError: The device, type or a tool is not supported.
         InputError: An option is out of range.
         TaichiRuntimeError: This process runs a Taichi that does not serve.
     """
@@ -75,7 +75,7 @@ class SimulatorTaichi(SimulatorCheckpointing):
         differentiable=True,
         devices=("cpu", "cuda"),
         dtypes=(torch.float32, torch.float64),
-        manipulator_kinds=MANIPULATOR_KINDS,
+        tool_kinds=TOOL_KINDS,
         deterministic_devices=("cpu",),
     )
 
@@ -114,11 +114,11 @@ class SimulatorTaichi(SimulatorCheckpointing):
 
     def _move_tools(self, state: State, actions: Tensor) -> Tensor:
         """Tool poses (B, T * substeps + 1, max(M, 1), 8) in every frame."""
-        worlds, steps, tools = state.batch_size, actions.shape[1], state.manipulator_pose.shape[1]
+        worlds, steps, tools = state.batch_size, actions.shape[1], state.tool_pose.shape[1]
         frames = steps * self.scene.substeps + 1
         poses = torch.zeros(worlds, frames, max(tools, 1), 8, dtype=self.dtype, device=self.device)
         if tools:
-            poses[:, 0] = state.manipulator_pose
+            poses[:, 0] = state.tool_pose
             self._program.kernels.move_tools(actions, self._program.tools, self.scene.substeps, tools, poses)
         return poses
 
@@ -126,7 +126,7 @@ class SimulatorTaichi(SimulatorCheckpointing):
         """Simulate T environment steps; see `Simulator.rollout`."""
         self.check_inputs(state, actions)
         state, actions = state.map(self._own), self._own(actions)
-        worlds, steps, tools = state.batch_size, actions.shape[1], state.manipulator_pose.shape[1]
+        worlds, steps, tools = state.batch_size, actions.shape[1], state.tool_pose.shape[1]
         positions = torch.empty(worlds, steps + 1, state.particle_count, 3, dtype=self.dtype, device=self.device)
         positions[:, 0] = state.position
         keep = worlds * self._history_bytes(steps) <= self.memory_budget
@@ -143,7 +143,7 @@ class SimulatorTaichi(SimulatorCheckpointing):
             final = _state(particles, frames[:, -1].clone())
         return Trajectory(
             positions=positions,
-            manipulator_poses=frames,
+            tool_poses=frames,
             actions=actions.clone(),
             initial_state=state,
             final_state=final,
@@ -165,21 +165,21 @@ class SimulatorTaichi(SimulatorCheckpointing):
         self,
         trajectory: Trajectory,
         grad_positions: Tensor,
-        grad_manipulators: Tensor | None = None,
+        grad_tools: Tensor | None = None,
         *,
         grad_final_state: State | None = None,
     ) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
-        positions, poses, final = self._incoming(trajectory, grad_positions, grad_manipulators, grad_final_state)
+        positions, poses, final = self._incoming(trajectory, grad_positions, grad_tools, grad_final_state)
         (kept,) = trajectory.checkpoints
         state, actions = trajectory.initial_state, kept.actions
         with self._stream():
             gradient, grad_poses = self._pull_back_particles(kept, positions, final)
             if poses is not None:
-                tools = state.manipulator_pose.shape[1]
+                tools = state.tool_pose.shape[1]
                 grad_poses[:, :: self.scene.substeps, :tools] += poses
-            grad_start, grad_actions = torch.zeros_like(state.manipulator_pose), torch.zeros_like(actions)
-            if tools := state.manipulator_pose.shape[1]:
+            grad_start, grad_actions = torch.zeros_like(state.tool_pose), torch.zeros_like(actions)
+            if tools := state.tool_pose.shape[1]:
                 inputs = (actions, self._program.tools, self.scene.substeps, tools, kept.poses)
                 self._program.kernels.move_tools_adjoint(*inputs, grad_poses, grad_actions, grad_start)
             start = _state(gradient, grad_start)

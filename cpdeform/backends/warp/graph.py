@@ -224,7 +224,7 @@ class RolloutSlot:
 
         self._arena = Arena(make)
         worlds, steps, _ = key
-        count, tools = start.particle_count, start.manipulator_pose.shape[1]
+        count, tools = start.particle_count, start.tool_pose.shape[1]
         self._tool_count = tools
         frames, columns = steps * program.substeps + 1, max(tools, 1)
         self._lane = Lane(program, worlds=worlds, particle_count=count, arrays=self._arena, full_grid=True)
@@ -238,7 +238,7 @@ class RolloutSlot:
         self._actions = torch.zeros(worlds, steps, action_size, **options)
         self._poses = torch.zeros(worlds, frames, columns, 8, **options)
         self._grad_positions = torch.zeros(steps + 1, worlds, count, 3, **options)
-        self._grad_manipulators = torch.zeros(worlds, steps + 1, tools, 8, **options)
+        self._grad_tools = torch.zeros(worlds, steps + 1, tools, 8, **options)
         # with respect to velocity, affine field and strain of the end; zero unless a vjp is given them
         self._grad_final = tuple(torch.zeros(shape, **options) for shape in shapes[1:])
         self._final_given = False
@@ -260,7 +260,7 @@ class RolloutSlot:
         self._tool_gradients: tuple[Any, ...] = ()
         if self._tool_count:
             self._tool_inputs = (_view(self._actions, types.real), program.tools, program.substeps, self._poses_view)
-            start = _view(self._gradient.manipulator_pose, types.vec8)
+            start = _view(self._gradient.tool_pose, types.vec8)
             self._tool_gradients = (self._grad_poses_view, _view(self._grad_actions, types.real), start)
 
     def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, Tensor, State]:
@@ -276,7 +276,7 @@ class RolloutSlot:
         tools = self._tool_count
         for rows, tensor in zip(self._rows, _particle_tensors(state), strict=True):
             rows[0].copy_(tensor)
-        self._poses[:, 0, :tools].copy_(state.manipulator_pose)
+        self._poses[:, 0, :tools].copy_(state.tool_pose)
         self._actions.copy_(actions)
         self._forward.run(self._launch_rollout)
         # a transposed tensor of one world counts as contiguous already, and `contiguous` would then copy nothing
@@ -284,19 +284,19 @@ class RolloutSlot:
         poses = self._poses[:, :: self._program.substeps, :tools].clone(memory_format=torch.contiguous_format)
         return positions, poses, _state([*(rows[-1].clone() for rows in self._rows), poses[:, -1].clone()])
 
-    def vjp(self, grad_positions: Tensor, grad_manipulators: Tensor | None, final: State | None = None) -> RolloutGradient:
+    def vjp(self, grad_positions: Tensor, grad_tools: Tensor | None, final: State | None = None) -> RolloutGradient:
         """Pull gradients back through the last rollout; see `Simulator.vjp`. The gradients are copies.
 
         Args:
             grad_positions: Gradient (W, T+1, N, 3).
-            grad_manipulators: Gradient (W, T+1, M, 8); None for zero.
+            grad_tools: Gradient (W, T+1, M, 8); None for zero.
             final: Gradient with respect to the final state, of whose positions and poses the other two know; None for zero.
         """
         self._grad_positions.copy_(grad_positions.transpose(0, 1))
-        if grad_manipulators is None:
-            self._grad_manipulators.zero_()
+        if grad_tools is None:
+            self._grad_tools.zero_()
         else:
-            self._grad_manipulators.copy_(grad_manipulators)
+            self._grad_tools.copy_(grad_tools)
         if final is not None:
             for kept, given in zip(self._grad_final, _particle_tensors(final)[1:], strict=True):
                 kept.copy_(given)
@@ -335,7 +335,7 @@ class RolloutSlot:
     def _launch_vjp(self) -> None:
         """All of a vjp; see `_launch_rollout` for what it may not do."""
         gradient, steps = self._gradient, self._key.steps
-        for tensor in (gradient.manipulator_pose, self._grad_actions, self._grad_poses):
+        for tensor in (gradient.tool_pose, self._grad_actions, self._grad_poses):
             tensor.zero_()
         for tensor, last in zip(_particle_tensors(gradient), (self._grad_positions[steps], *self._grad_final), strict=True):
             tensor.copy_(last)
@@ -345,7 +345,7 @@ class RolloutSlot:
             gradient.position.add_(self._grad_positions[step])
         if self._tool_inputs:
             frames = self._grad_poses[:, :: self._program.substeps, : self._tool_count]
-            frames.add_(self._grad_manipulators)
+            frames.add_(self._grad_tools)
             self._launch(self._program.kernels.move_tools_adjoint, (*self._tool_inputs, *self._tool_gradients))
         # the kernels hold the strain's gradient as a symmetric matrix; the state's off-diagonal numbers stand for two entries
         gradient.elastic_strain[..., 3:].mul_(2.0)

@@ -1,4 +1,4 @@
-"""Signed distances of the manipulators in their local frames, outward normals, and the derivative of the normals.
+"""Signed distances of the tools in their local frames, outward normals, and the derivative of the normals.
 
 The entries of `Tool.size`, lengths: Sphere (radius); Capsule, RollingPin and Chopsticks (radius, height); Box (half extents,
 rounding); Cylinder (radius, half height); Torus (major radius, tube radius). Chopsticks are the capsule nearer to a point:
@@ -14,7 +14,7 @@ import warp as wp
 from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, ROLLING_PIN, SPHERE, TORUS
 from cpdeform.backends.warp.kernels_types import build_types
 
-MANIPULATOR_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
 """The kinds of tools that the functions below know; the simulator refuses others."""
 
 

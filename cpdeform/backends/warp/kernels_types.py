@@ -27,7 +27,7 @@ def build_types(real: Any) -> SimpleNamespace:
         real: `wp.float32` or `wp.float64`.
 
     Returns:
-        vec3, vec4, vec6, vec7, vec8, mat33, the struct `Parameters` (the scene's constants) and the struct `Tool` (a manipulator).
+        vec3, vec4, vec6, vec7, vec8, mat33, the struct `Parameters` (the scene's constants) and the struct `Tool` (a tool).
     """
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)

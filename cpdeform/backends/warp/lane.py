@@ -56,7 +56,7 @@ class Program:
         types: Vector types, see `kernels_types`.
         kernels: All kernels.
         parameters: Constants of the scene.
-        tools: Manipulators.
+        tools: Tools.
         constants: Material of each particle.
         substeps: Substeps per environment step.
         device: Warp's name of the device.

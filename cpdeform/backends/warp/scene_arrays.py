@@ -22,7 +22,7 @@ def make_parameters(scene: Scene, real: Any) -> Any:
 
 
 def make_tools(scene: Scene, real: Any, device: str) -> Any:
-    """The manipulators of a scene as an array of the struct `Tool`; one unused entry where there is none."""
+    """The tools of a scene as an array of the struct `Tool`; one unused entry where there is none."""
     types = build_types(real)
     vectors = {3: types.vec3, 4: types.vec4, 7: types.vec7}
     tools = []

@@ -17,7 +17,7 @@ from torch import Tensor
 from cpdeform.backends.checkpointing import SimulatorCheckpointing
 from cpdeform.backends.kernel_cache import cache_folder, user_cache
 from cpdeform.backends.warp.graph import Capture, Graphs, Lease, RolloutSlot, SlotKey, SlotPool, capture_on_cuda
-from cpdeform.backends.warp.kernels_distance import MANIPULATOR_KINDS
+from cpdeform.backends.warp.kernels_distance import TOOL_KINDS
 from cpdeform.backends.warp.kernels_grid import build_grid
 from cpdeform.backends.warp.kernels_motion import build_motion
 from cpdeform.backends.warp.kernels_transfer import build_transfer
@@ -81,7 +81,7 @@ class SimulatorWarp(SimulatorCheckpointing):
             otherwise their kernels are launched one by one. Without effect on the CPU.
 
     Raises:
-        CapabilityError: The device, type or a manipulator is not supported.
+        CapabilityError: The device, type or a tool is not supported.
         InputError: An option is out of range.
     """
 
@@ -89,7 +89,7 @@ class SimulatorWarp(SimulatorCheckpointing):
         differentiable=True,
         devices=("cpu", "cuda"),
         dtypes=(torch.float32, torch.float64),
-        manipulator_kinds=MANIPULATOR_KINDS,
+        tool_kinds=TOOL_KINDS,
         deterministic_devices=("cpu",),
     )
 
@@ -184,11 +184,11 @@ class SimulatorWarp(SimulatorCheckpointing):
 
     def _move_tools(self, state: State, actions: Tensor) -> Tensor:
         """Tool poses (B, T * substeps + 1, max(M, 1), 8) in every frame."""
-        worlds, steps, tools = state.batch_size, actions.shape[1], state.manipulator_pose.shape[1]
+        worlds, steps, tools = state.batch_size, actions.shape[1], state.tool_pose.shape[1]
         frames = steps * self.scene.substeps + 1
         poses = torch.zeros(worlds, frames, max(tools, 1), 8, dtype=self.dtype, device=self.device)
         if tools:
-            poses[:, 0] = state.manipulator_pose
+            poses[:, 0] = state.tool_pose
             inputs = [
                 self._wrap(actions, self._real),
                 self._program.tools,
@@ -216,7 +216,7 @@ class SimulatorWarp(SimulatorCheckpointing):
             lease, (positions, poses, final) = slots.with_memory(work)
         return Trajectory(
             positions=positions,
-            manipulator_poses=poses,
+            tool_poses=poses,
             actions=actions,
             initial_state=state,
             final_state=final,
@@ -225,7 +225,7 @@ class SimulatorWarp(SimulatorCheckpointing):
 
     def _rollout_lanes(self, state: State, actions: Tensor, keep: bool) -> Trajectory:
         """Launch a rollout kernel by kernel."""
-        worlds, steps, tools = state.batch_size, actions.shape[1], state.manipulator_pose.shape[1]
+        worlds, steps, tools = state.batch_size, actions.shape[1], state.tool_pose.shape[1]
         shape = (worlds, steps + 1, state.particle_count, 3)
         positions = torch.empty(shape, dtype=self.dtype, device=self.device)
         final = state.map(torch.empty_like)
@@ -235,10 +235,10 @@ class SimulatorWarp(SimulatorCheckpointing):
                 self._lanes(worlds), lambda pair: self._rollout_lane(pair[0], pair[1], state, poses, positions, final, steps, keep)
             )
         frames = poses[:, :: self.scene.substeps, :tools]
-        final = dataclasses.replace(final, manipulator_pose=frames[:, -1].clone())
+        final = dataclasses.replace(final, tool_pose=frames[:, -1].clone())
         return Trajectory(
             positions=positions,
-            manipulator_poses=frames.clone(),
+            tool_poses=frames.clone(),
             # the checkpoints hold those that were rolled out
             actions=actions.clone(),
             initial_state=state.clone(),
@@ -286,12 +286,12 @@ class SimulatorWarp(SimulatorCheckpointing):
         self,
         trajectory: Trajectory,
         grad_positions: Tensor,
-        grad_manipulators: Tensor | None = None,
+        grad_tools: Tensor | None = None,
         *,
         grad_final_state: State | None = None,
     ) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
-        positions, poses, final = self._incoming(trajectory, grad_positions, grad_manipulators, grad_final_state)
+        positions, poses, final = self._incoming(trajectory, grad_positions, grad_tools, grad_final_state)
         lease = trajectory.checkpoints[0]
         if self._slots is None or not isinstance(lease, Lease):
             return self._vjp_lanes(trajectory, positions, poses, final)
@@ -300,7 +300,7 @@ class SimulatorWarp(SimulatorCheckpointing):
             return self._slots.with_memory(lambda: slot.vjp(positions, poses, final))
 
     def _vjp_lanes(
-        self, trajectory: Trajectory, grad_positions: Tensor, grad_manipulators: Tensor | None, final: State | None
+        self, trajectory: Trajectory, grad_positions: Tensor, grad_tools: Tensor | None, final: State | None
     ) -> RolloutGradient:
         """Launch a vjp kernel by kernel."""
         (kept,) = trajectory.checkpoints
@@ -316,9 +316,9 @@ class SimulatorWarp(SimulatorCheckpointing):
                 lambda pair: self._vjp_lane(pair[0][0], pair[1], grad_positions, gradient),
             )
             grad_poses = torch.cat(parts)
-            if grad_manipulators is not None:
-                tools = state.manipulator_pose.shape[1]
-                grad_poses[:, :: self.scene.substeps, :tools] += grad_manipulators.to(grad_poses)
+            if grad_tools is not None:
+                tools = state.tool_pose.shape[1]
+                grad_poses[:, :: self.scene.substeps, :tools] += grad_tools.to(grad_poses)
             grad_actions = self._pull_back_tools(kept, grad_poses, gradient)
         # the kernels hold the strain's gradient as a symmetric matrix; the state's off-diagonal numbers stand for two entries
         gradient.elastic_strain[..., 3:] *= 2.0
@@ -354,7 +354,7 @@ class SimulatorWarp(SimulatorCheckpointing):
     def _pull_back_tools(self, kept: _Checkpoints, grad_poses: Tensor, gradient: State) -> Tensor:
         """Gradient (B, T, A) of the actions; writes that of the start poses to `gradient`."""
         grad_actions = torch.zeros_like(kept.actions)
-        worlds, tools = gradient.manipulator_pose.shape[:2]
+        worlds, tools = gradient.tool_pose.shape[:2]
         if not tools:
             return grad_actions
         types = self._types
@@ -365,7 +365,7 @@ class SimulatorWarp(SimulatorCheckpointing):
             self._wrap(kept.poses, types.vec8),
             self._wrap(grad_poses, types.vec8),
             self._wrap(grad_actions, self._real),
-            self._wrap(gradient.manipulator_pose, types.vec8),
+            self._wrap(gradient.tool_pose, types.vec8),
         ]
         wp.launch(self._program.kernels.move_tools_adjoint, dim=(worlds, tools), inputs=inputs, device=self._program.device)
         return grad_actions

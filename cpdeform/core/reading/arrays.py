@@ -1,6 +1,6 @@
 """Arrays of unknown origin, from ``.npz``, ``.npy`` and HDF5 files, which are told apart by their content.
 
-with open_arrays(path, argument=f"target file {path}", expected="...") as file:
+with open_arrays(path, argument=f"goal file {path}", expected="...") as file:
     positions = file.read("position", shape=("M", 3))
     weights = file.read("weight", shape=("M",))  # the same M
 """

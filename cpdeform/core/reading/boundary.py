@@ -25,7 +25,7 @@ def boundary(argument: str, *, expected: str) -> Iterator[None]:
     """Turn whatever is raised inside into one `InputError`; errors that are for the user already pass as they are.
 
     Args:
-        argument: What is read, e.g. ``"target file goal.npz"``.
+        argument: What is read, e.g. ``"goal file goal.npz"``.
         expected: What would have been accepted.
 
     Raises:

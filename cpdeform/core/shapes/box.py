@@ -13,7 +13,7 @@ from cpdeform.core.model import Vector3
 from cpdeform.core.shapes.base import Array, RandomNumbers, Shape
 from cpdeform.core.shapes.body import BodyBase
 from cpdeform.core.shapes.lengths import corner_distance
-from cpdeform.core.shapes.manipulator import ManipulatorBase
+from cpdeform.core.shapes.tool import ToolBase
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -86,7 +86,7 @@ def _densify(points: Array, count: int, *, axis: int) -> Array:
     return np.asarray((1.0 - weight) * np.take(points, lower, axis=axis) + weight * np.take(points, lower + 1, axis=axis))
 
 
-class ManipulatorBox(ManipulatorBase):
+class ToolBox(ToolBase):
     """A block of `half_extents` (3,), grown by `rounding` on all sides, length units."""
 
     kind: Literal["Box"] = "Box"
@@ -94,17 +94,17 @@ class ManipulatorBox(ManipulatorBase):
     rounding: Coordinate = Field(default=0.0, ge=0.0)
 
     def shape(self, *, gap: Tensor | float | None = None) -> ShapeBox:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return ShapeBox(self.half_extents, self.rounding)
 
     @property
     def kernel_lengths(self) -> tuple[float, ...]:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return (*self.half_extents, self.rounding)
 
     @property
     def thinnest_axis(self) -> int:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return self.half_extents.index(min(self.half_extents))
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from cpdeform.core.bounded import Length
 from cpdeform.core.shapes.base import Array, Shape
 from cpdeform.core.shapes.lengths import segment_distance
-from cpdeform.core.shapes.manipulator import ManipulatorBase
 from cpdeform.core.shapes.rod import ShapeRod
+from cpdeform.core.shapes.tool import ToolBase
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -66,7 +66,7 @@ class ShapeChopsticks(Shape):
         return both - disc_lens * self.height - ball_lens
 
 
-class ManipulatorChopsticks(ManipulatorBase):
+class ToolChopsticks(ToolBase):
     """Two parallel rods of `radius` and `height` at x = +-gap/2 of the local frame, whose origin is at their upper ends.
 
     Attributes:
@@ -84,15 +84,15 @@ class ManipulatorChopsticks(ManipulatorBase):
     )
 
     def shape(self, *, gap: Tensor | float | None = None) -> ShapeChopsticks:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return ShapeChopsticks(self.radius, self.height, self.gap if gap is None else gap)
 
     @property
     def kernel_lengths(self) -> tuple[float, ...]:
-        """See `ManipulatorBase`; the gap is a number of the pose."""
+        """See `ToolBase`; the gap is a number of the pose."""
         return (self.radius, self.height)
 
     @property
     def start_gap(self) -> float:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return self.gap

@@ -10,8 +10,8 @@ import numpy as np
 from cpdeform.core.bounded import Length
 from cpdeform.core.shapes.base import Array, Shape
 from cpdeform.core.shapes.lengths import along_and_across, corner_distance, length
-from cpdeform.core.shapes.manipulator import ManipulatorBase
 from cpdeform.core.shapes.meshes import revolve
+from cpdeform.core.shapes.tool import ToolBase
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -45,7 +45,7 @@ class ShapeCylinder(Shape):
         return 2.0 * np.pi * self.radius**2 * self.half_height
 
 
-class ManipulatorCylinder(ManipulatorBase):
+class ToolCylinder(ToolBase):
     """A solid cylinder about the local y axis: `radius` and `half_height`, length units."""
 
     kind: Literal["Cylinder"] = "Cylinder"
@@ -53,10 +53,10 @@ class ManipulatorCylinder(ManipulatorBase):
     half_height: Length
 
     def shape(self, *, gap: Tensor | float | None = None) -> ShapeCylinder:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return ShapeCylinder(self.radius, self.half_height)
 
     @property
     def kernel_lengths(self) -> tuple[float, ...]:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return (self.radius, self.half_height)

@@ -9,24 +9,18 @@ from typing import Annotated, Any, get_args
 from pydantic import Field
 
 from cpdeform.core.shapes.body import BodyBase
-from cpdeform.core.shapes.box import BodyBox, ManipulatorBox
-from cpdeform.core.shapes.chopsticks import ManipulatorChopsticks
-from cpdeform.core.shapes.cylinder import ManipulatorCylinder
-from cpdeform.core.shapes.manipulator import ManipulatorBase
-from cpdeform.core.shapes.rod import ManipulatorCapsule, ManipulatorRollingPin
-from cpdeform.core.shapes.sphere import BodySphere, ManipulatorSphere
-from cpdeform.core.shapes.torus import ManipulatorTorus
+from cpdeform.core.shapes.box import BodyBox, ToolBox
+from cpdeform.core.shapes.chopsticks import ToolChopsticks
+from cpdeform.core.shapes.cylinder import ToolCylinder
+from cpdeform.core.shapes.rod import ToolCapsule, ToolRollingPin
+from cpdeform.core.shapes.sphere import BodySphere, ToolSphere
+from cpdeform.core.shapes.tool import ToolBase
+from cpdeform.core.shapes.torus import ToolTorus
 
 Body = Annotated[BodyBox | BodySphere, Field(discriminator="kind")]
 
-Manipulator = Annotated[
-    ManipulatorSphere
-    | ManipulatorCapsule
-    | ManipulatorBox
-    | ManipulatorCylinder
-    | ManipulatorTorus
-    | ManipulatorRollingPin
-    | ManipulatorChopsticks,
+Tool = Annotated[
+    ToolSphere | ToolCapsule | ToolBox | ToolCylinder | ToolTorus | ToolRollingPin | ToolChopsticks,
     Field(discriminator="kind"),
 ]
 """Kernels know a kind by its place in this list, those in C++ too: new kinds go to the end."""
@@ -38,4 +32,4 @@ def _by_kind(union: Any) -> dict[str, Any]:
 
 
 BODIES: Mapping[str, type[BodyBase]] = MappingProxyType(_by_kind(Body))
-MANIPULATORS: Mapping[str, type[ManipulatorBase]] = MappingProxyType(_by_kind(Manipulator))
+TOOLS: Mapping[str, type[ToolBase]] = MappingProxyType(_by_kind(Tool))

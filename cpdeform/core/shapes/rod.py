@@ -12,8 +12,8 @@ import numpy as np
 from cpdeform.core.bounded import Length
 from cpdeform.core.shapes.base import Array, Shape
 from cpdeform.core.shapes.lengths import along_and_across, segment_distance
-from cpdeform.core.shapes.manipulator import ManipulatorBase
 from cpdeform.core.shapes.meshes import arc, mirrored, revolve
+from cpdeform.core.shapes.tool import ToolBase
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -45,29 +45,29 @@ class ShapeRod(Shape):
         return np.pi * self.radius**2 * (self.height + 4.0 / 3.0 * self.radius)
 
 
-class ManipulatorRod(ManipulatorBase):
+class ToolRod(ToolBase):
     """All points within `radius` of the segment y in [-height/2, height/2] of the local frame, length units."""
 
     radius: Length
     height: Length
 
     def shape(self, *, gap: Tensor | float | None = None) -> ShapeRod:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return ShapeRod(self.radius, self.height)
 
     @property
     def kernel_lengths(self) -> tuple[float, ...]:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return (self.radius, self.height)
 
 
-class ManipulatorCapsule(ManipulatorRod):
+class ToolCapsule(ToolRod):
     """A rod that is moved like any tool."""
 
     kind: Literal["Capsule"] = "Capsule"
 
 
-class ManipulatorRollingPin(ManipulatorRod):
+class ToolRollingPin(ToolRod):
     """A rod that rolls.
 
     Its three actions turn it about its own axis (radians), rolling it sideways by 0.03 length units a radian, turn it about the

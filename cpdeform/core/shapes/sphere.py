@@ -12,8 +12,8 @@ from cpdeform.core.model import Vector3
 from cpdeform.core.shapes.base import Array, RandomNumbers, Shape
 from cpdeform.core.shapes.body import BodyBase
 from cpdeform.core.shapes.lengths import length
-from cpdeform.core.shapes.manipulator import ManipulatorBase
 from cpdeform.core.shapes.meshes import arc, mirrored, revolve
+from cpdeform.core.shapes.tool import ToolBase
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -51,19 +51,19 @@ class ShapeSphere(Shape):
         return np.asarray(direction * share * self.radius)
 
 
-class ManipulatorSphere(ManipulatorBase):
+class ToolSphere(ToolBase):
     """A ball. Attributes: radius, length units."""
 
     kind: Literal["Sphere"] = "Sphere"
     radius: Length
 
     def shape(self, *, gap: Tensor | float | None = None) -> ShapeSphere:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return ShapeSphere(self.radius)
 
     @property
     def kernel_lengths(self) -> tuple[float, ...]:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return (self.radius,)
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from cpdeform.core.bounded import Length
 from cpdeform.core.shapes.base import Array, Shape
 from cpdeform.core.shapes.lengths import along_and_across, length
-from cpdeform.core.shapes.manipulator import ManipulatorBase
 from cpdeform.core.shapes.meshes import revolve
+from cpdeform.core.shapes.tool import ToolBase
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -51,7 +51,7 @@ class ShapeTorus(Shape):
         return 4.0 * math.pi * (root**3 / 3.0 + major * half_section)
 
 
-class ManipulatorTorus(ManipulatorBase):
+class ToolTorus(ToolBase):
     """A ring about the local y axis: `major_radius` to the tube's centre and `tube_radius`, length units."""
 
     kind: Literal["Torus"] = "Torus"
@@ -59,10 +59,10 @@ class ManipulatorTorus(ManipulatorBase):
     tube_radius: Length
 
     def shape(self, *, gap: Tensor | float | None = None) -> ShapeTorus:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return ShapeTorus(self.major_radius, self.tube_radius)
 
     @property
     def kernel_lengths(self) -> tuple[float, ...]:
-        """See `ManipulatorBase`."""
+        """See `ToolBase`."""
         return (self.major_radius, self.tube_radius)

@@ -23,7 +23,7 @@ class ProposerCurrent(Proposer):
     def propose(self, search: ContactSearch, contact: int | None) -> list[Proposal]:
         """The current poses."""
         stage, poses = search.exploration.stage, search.poses
-        for manipulator, pose in zip(stage.scene.manipulators, poses, strict=True):
-            if manipulator.movable and float(signed_distance(manipulator, pose, stage.state.position[0]).min()) < -CURRENT_DEPTH:
+        for tool, pose in zip(stage.scene.tools, poses, strict=True):
+            if tool.movable and float(signed_distance(tool, pose, stage.state.position[0]).min()) < -CURRENT_DEPTH:
                 return []
         return [Proposal(pose=poses, score=float("nan"), label=self.name)]

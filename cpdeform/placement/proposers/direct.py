@@ -14,7 +14,7 @@ class ProposerDirect(Proposer):
 
     References:
         Li et al., "Contact Points Discovery for Soft-Body Manipulations with Differentiable Physics", ICLR 2022, section "Direct
-        Single Manipulator Placement".
+        Single Tool Placement".
     """
 
     name = "direct"

@@ -23,7 +23,7 @@ class ProposerGrasp(Proposer):
 
     References:
         Li et al., "Contact Points Discovery for Soft-Body Manipulations with Differentiable Physics", ICLR 2022, section "Multiple
-        Manipulator Placement With Heuristic".
+        Tool Placement With Heuristic".
     """
 
     def __init__(self, name: str) -> None:
@@ -36,7 +36,7 @@ class ProposerGrasp(Proposer):
         if contact is None:
             return []
         particles, scene = search.particles, search.exploration.stage.scene
-        grasps = GraspSearch(manipulators=scene.manipulators, particles=particles, clearance=search.options.clearance)
+        grasps = GraspSearch(tools=scene.tools, particles=particles, clearance=search.options.clearance)
         direction = torch.tensor(GRASP_DIRECTIONS[self.name]).to(particles)
         poses, cost, placed = search.poses, search.cost(), search.fixed
         pairs = [search.movable[start : start + TOOLS_PER_GRASP] for start in range(0, len(search.movable), TOOLS_PER_GRASP)]

@@ -25,7 +25,7 @@ class ProposerPush(Proposer):
         """One push of all tools, whose clay then counts as explored; nothing where there is no room for each of them."""
         exploration, poses, placed = search.exploration, search.poses, search.fixed
         pushing = PushSearch(
-            manipulators=exploration.stage.scene.manipulators,
+            tools=exploration.stage.scene.tools,
             particles=search.particles,
             displacements=exploration.stage.displacements,
             distance_scale=search.distance_scale,

@@ -36,7 +36,7 @@ class TouchDrag(Touch):
         """See `Touch`."""
         direction = unit(self.direction, room.particles)
         inward = -aside(direction, self.side)
-        rotation = facing(room.scene.manipulators[self.tool], inward, edge=False, roll=0.0)
+        rotation = facing(room.scene.tools[self.tool], inward, edge=False, roll=0.0)
         pose = room.behind(self.tool, rotation, torch.as_tensor(self.contact).to(direction), inward)
         return None if pose is None else {self.tool: Move(pose, self.way * direction + self.closing * inward)}
 

@@ -55,7 +55,7 @@ class TouchPinch(Touch):
         found: dict[int, Move] = {}
         for index, sign, tilt, closing in zip(self.tools, (1.0, -1.0), self.tilts, self.closings, strict=True):
             inward = rotate(turn_about(axis, sign * tilt), -sign * across)
-            rotation = facing(room.scene.manipulators[index], inward, edge=False, roll=0.0)
+            rotation = facing(room.scene.tools[index], inward, edge=False, roll=0.0)
             pose = room.behind(index, rotation, contact, inward)
             if pose is None:
                 return None

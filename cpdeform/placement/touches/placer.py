@@ -12,8 +12,8 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.ot import TransportProblem
 from cpdeform.core.placer import Candidate, Placer, PlacerCapabilities, Proposal, Stage
 from cpdeform.core.priorities import DISPLACEMENT_EXPONENT
-from cpdeform.core.scene import Manipulator, ManipulatorRollingPin, Scene
-from cpdeform.placement.grid import movable_manipulators
+from cpdeform.core.scene import Scene, Tool, ToolRollingPin
+from cpdeform.placement.grid import movable_tools
 from cpdeform.placement.tool import surface_points
 from cpdeform.placement.touches.draw import LONGEST_WAY, TouchDraw
 from cpdeform.placement.touches.together import label
@@ -63,7 +63,7 @@ class PlacerTouch(Placer):
         InputError: An option is out of range.
     """
 
-    capabilities = PlacerCapabilities(needs_priorities=True, max_manipulators=None)
+    capabilities = PlacerCapabilities(needs_priorities=True, max_tools=None)
 
     def __init__(self, *, count: int = 96, variations: int = 32, widths: tuple[float, ...] = (1.0, 0.5), parents: int = 8) -> None:
         for name, number in (("count", count), ("variations", variations), ("parents", parents)):
@@ -148,7 +148,7 @@ def place(touch: Touch, room: Room, *, steps: int) -> tuple[Tensor, Tensor] | No
     back = max(1, round(BACK_SHARE * steps))
     going = max(1, steps - back)
     offset = 0
-    for index, tool in enumerate(room.scene.manipulators):
+    for index, tool in enumerate(room.scene.tools):
         if index in moves:
             poses[index] = moves[index].pose
             command = _command(tool, moves[index].way / going)
@@ -159,10 +159,10 @@ def place(touch: Touch, room: Room, *, steps: int) -> tuple[Tensor, Tensor] | No
     return (poses, actions) if bool(actions.any()) else None
 
 
-def _command(tool: Manipulator, step: Tensor) -> Tensor:
+def _command(tool: Tool, step: Tensor) -> Tensor:
     """Actions (3,) that move a tool by a vector (3,), length units, in an environment step, as far as they can."""
     scale = torch.tensor(tool.action_scale[:3])
-    if isinstance(tool, ManipulatorRollingPin):
+    if isinstance(tool, ToolRollingPin):
         # It rolls across its axis and lifts; it does not turn here.
         level = float(torch.linalg.vector_norm(step[[0, 2]])) * (1.0 if float(step[0] + step[2]) >= 0.0 else -1.0)
         step = torch.tensor([level / ROLLING_RADIUS, 0.0, float(step[1])])
@@ -172,18 +172,18 @@ def _command(tool: Manipulator, step: Tensor) -> Tensor:
 
 
 def _begin(stage: Stage) -> _Search:
-    movable = movable_manipulators(stage)
+    movable = movable_tools(stage)
     particles = stage.state.position[0].detach()
     room = Room(
         scene=stage.scene,
         particles=particles,
         poses=_out_of_the_way(stage, movable),
         floor=float(particles[:, 1].min()),
-        surfaces=tuple(surface_points(tool).to(particles) for tool in stage.scene.manipulators),
+        surfaces=tuple(surface_points(tool).to(particles) for tool in stage.scene.tools),
     )
     seed = int(torch.randint(2**31, (1,), generator=stage.generator))
     edge = _clay_volume(stage.scene) ** (1.0 / 3.0)
-    speed = max(max(stage.scene.manipulators[index].action_scale[:3]) for index in movable)
+    speed = max(max(stage.scene.tools[index].action_scale[:3]) for index in movable)
     draw = TouchDraw(
         particles=particles.double().cpu().numpy(),
         displacements=stage.displacements.detach().double().cpu().numpy(),
@@ -200,9 +200,9 @@ def _clay_volume(scene: Scene) -> float:
 
 def _out_of_the_way(stage: Stage, movable: list[int]) -> Tensor:
     """Poses (M, 8) with every movable tool high above the clay, where it is in nobody's way."""
-    poses = stage.state.manipulator_pose[0].detach().clone()
+    poses = stage.state.tool_pose[0].detach().clone()
     for number, index in enumerate(movable):
-        tool = stage.scene.manipulators[index]
+        tool = stage.scene.tools[index]
         lower, upper = poses.new_tensor(tool.lower_bound), poses.new_tensor(tool.upper_bound)
         place = poses.new_tensor([(number + 0.5) / len(movable), 0.9, 0.5])
         poses[index, :3] = place.clamp(lower, upper)

@@ -35,7 +35,7 @@ class TouchPush(Touch):
     def moves(self, room: Room) -> dict[int, Move] | None:
         """See `Touch`."""
         direction = unit(self.direction, room.particles)
-        rotation = facing(room.scene.manipulators[self.tool], direction, edge=self.edge, roll=self.roll)
+        rotation = facing(room.scene.tools[self.tool], direction, edge=self.edge, roll=self.roll)
         pose = room.behind(self.tool, rotation, torch.as_tensor(self.contact).to(direction), direction)
         return None if pose is None else {self.tool: Move(pose, self.way * direction)}
 

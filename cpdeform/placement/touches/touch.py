@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.rotation import multiply, rotate, rotate_inverse
-from cpdeform.core.scene import Manipulator, Scene
+from cpdeform.core.scene import Scene, Tool
 from cpdeform.core.signed_distance import local_distance, signed_distance
 from cpdeform.placement.tool import tool_half_extents
 
@@ -71,7 +71,7 @@ class Room:
     @property
     def movable(self) -> list[int]:
         """Indices of the movable tools."""
-        return [index for index, tool in enumerate(self.scene.manipulators) if tool.movable]
+        return [index for index, tool in enumerate(self.scene.tools) if tool.movable]
 
     def nearest(self, contact: Vector) -> int:
         """Index of the particle nearest to a point (3,), length units."""
@@ -89,7 +89,7 @@ class Room:
         Returns:
             The pose (8,); None where there is no room within the tool's bounds and above the floor.
         """
-        tool = self.scene.manipulators[index]
+        tool = self.scene.tools[index]
         low = self.floor + float(tool_half_extents(tool, rotation)[1])
         start = contact.clone()
         start[1] = max(float(start[1]), low)
@@ -101,7 +101,7 @@ class Room:
             return None
         return torch.cat([position, rotation, self.poses[index, 7:]])
 
-    def _way_out(self, tool: Manipulator, rotation: Tensor, start: Tensor, direction: Tensor) -> float:
+    def _way_out(self, tool: Tool, rotation: Tensor, start: Tensor, direction: Tensor) -> float:
         """How far a tool at `start` (3,) has to move along `direction` (3,) to be free of the clay; infinity if it does not press.
 
         A tool that reaches a depth into the clay is not free before it has moved by that depth.
@@ -137,7 +137,7 @@ class Room:
             poses[index] = move.pose
         for index in moves:
             surface = rotate(poses[index, 3:7], self.surfaces[index]) + poses[index, :3]
-            for other, tool in enumerate(self.scene.manipulators):
+            for other, tool in enumerate(self.scene.tools):
                 if other != index and float(signed_distance(tool, poses[other], surface).min()) < BETWEEN_TOOLS:
                     return False
         return True
@@ -168,7 +168,7 @@ class Touch(abc.ABC):
         """
 
 
-def facing(tool: Manipulator, direction: Tensor, *, edge: bool, roll: float) -> Tensor:
+def facing(tool: Tool, direction: Tensor, *, edge: bool, roll: float) -> Tensor:
     """Rotation in which a flat tool turns its broad face (or its edge) along a direction, upright where it can be, then rolled.
 
     Args:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.scene import Manipulator, Scene
+from cpdeform.core.scene import Scene, Tool
 from cpdeform.core.signed_distance import signed_distance
 
 ContactKind = Literal["hard", "soft", "plasticinelab"]
@@ -23,7 +23,7 @@ def check_contact_kind(kind: str) -> None:
         raise InputError("contact", came=f'"{kind}"', expected="one of " + ", ".join(get_args(ContactKind)))
 
 
-def contact_loss(scene: Scene, positions: Tensor, manipulator_poses: Tensor, *, kind: ContactKind = "hard") -> Tensor:
+def contact_loss(scene: Scene, positions: Tensor, tool_poses: Tensor, *, kind: ContactKind = "hard") -> Tensor:
     """Squared distance between the body and each movable tool, summed over the tools.
 
     With d_i = max(signed distance of particle i, 0), a tool contributes (min_i d_i)^2 (``"hard"``) or
@@ -33,9 +33,9 @@ def contact_loss(scene: Scene, positions: Tensor, manipulator_poses: Tensor, *, 
     particles that pulls tools to the body thousands of times harder than the loss's own gradient.
 
     Args:
-        scene: Whose tools `manipulator_poses` are.
+        scene: Whose tools `tool_poses` are.
         positions: Particle positions (..., N, 3), length units.
-        manipulator_poses: Tool poses (..., M, 8) at the same times; see `State.manipulator_pose`.
+        tool_poses: Tool poses (..., M, 8) at the same times; see `State.tool_pose`.
         kind: ``"hard"``, ``"soft"`` or ``"plasticinelab"``.
 
     Returns:
@@ -50,29 +50,29 @@ def contact_loss(scene: Scene, positions: Tensor, manipulator_poses: Tensor, *, 
     check_contact_kind(kind)
     distance = {"hard": _hard_distance, "soft": _soft_distance, "plasticinelab": _spread_distance}[kind]
     total = positions.new_zeros(positions.shape[:-2])
-    for index, manipulator in enumerate(scene.manipulators):
-        if manipulator.movable:
-            total = total + torch.square(distance(manipulator, manipulator_poses[..., index, :], positions))
+    for index, tool in enumerate(scene.tools):
+        if tool.movable:
+            total = total + torch.square(distance(tool, tool_poses[..., index, :], positions))
     return total
 
 
-def _hard_distance(manipulator: Manipulator, pose: Tensor, positions: Tensor) -> Tensor:
+def _hard_distance(tool: Tool, pose: Tensor, positions: Tensor) -> Tensor:
     """Distance (...) to the nearest particle; only that one has to be part of the autograd graph."""
     with torch.no_grad():
-        index = signed_distance(manipulator, pose, positions).argmin(dim=-1)
+        index = signed_distance(tool, pose, positions).argmin(dim=-1)
     nearest = positions.gather(-2, index[..., None, None].expand(*index.shape, 1, 3))
-    return signed_distance(manipulator, pose, nearest).squeeze(-1).clamp(min=0.0)
+    return signed_distance(tool, pose, nearest).squeeze(-1).clamp(min=0.0)
 
 
-def _soft_distance(manipulator: Manipulator, pose: Tensor, positions: Tensor) -> Tensor:
+def _soft_distance(tool: Tool, pose: Tensor, positions: Tensor) -> Tensor:
     """Mean (...) of the particles' distances, weighted towards the near ones."""
-    gap = signed_distance(manipulator, pose, positions).clamp(min=0.0)
+    gap = signed_distance(tool, pose, positions).clamp(min=0.0)
     weight = 1.0 / (1.0 + SOFT_WEIGHT_DECAY * gap * gap)
     return (weight * gap).sum(dim=-1) / weight.sum(dim=-1)
 
 
-def _spread_distance(manipulator: Manipulator, pose: Tensor, positions: Tensor) -> Tensor:
+def _spread_distance(tool: Tool, pose: Tensor, positions: Tensor) -> Tensor:
     """Distance (...) to the nearest particle, with the sum of all particles' gradients."""
-    gap = signed_distance(manipulator, pose, positions).clamp(min=0.0)
+    gap = signed_distance(tool, pose, positions).clamp(min=0.0)
     total = gap.sum(dim=-1)
     return gap.amin(dim=-1).detach() + (total - total.detach())

@@ -24,7 +24,7 @@ class ObjectiveDensity(ObjectiveAutograd):
 
     Args:
         scene: Grid and particle mass.
-        target_grid: Node masses (G, G, G) of the goal, as `mass_grid` makes them.
+        goal_grid: Node masses (G, G, G) of the goal, as `mass_grid` makes them.
 
     Raises:
         InputError: The grid does not fit the scene, or holds no mass.
@@ -33,22 +33,22 @@ class ObjectiveDensity(ObjectiveAutograd):
         Huang et al., "PlasticineLab: A Soft-Body Manipulation Benchmark with Differentiable Physics", ICLR 2021.
     """
 
-    def __init__(self, scene: Scene, target_grid: Tensor | NDArray[Any]) -> None:
-        self.scene, self.target_grid = scene, check_target_grid(target_grid, scene)
+    def __init__(self, scene: Scene, goal_grid: Tensor | NDArray[Any]) -> None:
+        self.scene, self.goal_grid = scene, check_goal_grid(goal_grid, scene)
 
-    def loss(self, positions: Tensor, manipulator_poses: Tensor) -> Tensor:
+    def loss(self, positions: Tensor, tool_poses: Tensor) -> Tensor:
         """Misplaced share (B,) of the mass at the last step of positions (B, T+1, N, 3); the tools do not count."""
         mass = mass_grid(positions[:, -1].double(), self.scene)
-        target = self.target_grid.to(mass)
-        misplaced: Tensor = (mass - target).abs().sum(dim=(-3, -2, -1)) / (2.0 * target.sum())
+        goal = self.goal_grid.to(mass)
+        misplaced: Tensor = (mass - goal).abs().sum(dim=(-3, -2, -1)) / (2.0 * goal.sum())
         return misplaced
 
 
-def check_target_grid(target_grid: Tensor | NDArray[Any], scene: Scene) -> Tensor:
+def check_goal_grid(goal_grid: Tensor | NDArray[Any], scene: Scene) -> Tensor:
     """Node masses (G, G, G) of a goal in double precision; `InputError` where they do not fit the scene or hold no mass."""
-    grid = torch.as_tensor(target_grid).detach().double()
+    grid = torch.as_tensor(goal_grid).detach().double()
     if tuple(grid.shape) != (scene.grid_size,) * 3:
-        raise InputError("target_grid", came=f"shape {tuple(grid.shape)}", expected=f"shape {(scene.grid_size,) * 3}")
+        raise InputError("goal_grid", came=f"shape {tuple(grid.shape)}", expected=f"shape {(scene.grid_size,) * 3}")
     if not bool(torch.isfinite(grid).all()) or not float(grid.sum()) > 0.0:
-        raise InputError("target_grid", came="no mass or non-finite masses", expected="finite masses with a positive sum")
+        raise InputError("goal_grid", came="no mass or non-finite masses", expected="finite masses with a positive sum")
     return grid

@@ -43,22 +43,22 @@ def _normalise(grid: Tensor, name: str) -> Tensor:
     return grid / largest
 
 
-def incremental_iou(grid: Tensor, start: Tensor, target: Tensor) -> Tensor:
-    """Normalised incremental IoU: the part of the way from the start's to the target's own IoU that a result made.
+def incremental_iou(grid: Tensor, start: Tensor, goal: Tensor) -> Tensor:
+    """Normalised incremental IoU: the part of the way from the start's to the goal's own IoU that a result made.
 
-    It is clip((IoU - IoU_start) / (IoU(target, target) - IoU_start), 0, 1).
+    It is clip((IoU - IoU_start) / (IoU(goal, goal) - IoU_start), 0, 1).
 
     Args:
         grid: Node masses (..., G, G, G) of the result.
         start: Node masses (..., G, G, G) of the start.
-        target: Node masses (..., G, G, G) of the goal.
+        goal: Node masses (..., G, G, G) of the goal.
 
     Returns:
-        Normalised incremental IoU (...), dimensionless, in [0, 1]; nan where the start equals the target, since there is no
+        Normalised incremental IoU (...), dimensionless, in [0, 1]; nan where the start equals the goal, since there is no
         way to go.
 
     Raises:
         InputError: The grids differ in size, or a grid has no mass.
     """
-    begin = soft_iou(start, target)
-    return torch.clip((soft_iou(grid, target) - begin) / (soft_iou(target, target) - begin), 0.0, 1.0)
+    begin = soft_iou(start, goal)
+    return torch.clip((soft_iou(grid, goal) - begin) / (soft_iou(goal, goal) - begin), 0.0, 1.0)

@@ -28,7 +28,7 @@ class ObjectiveShape(Objective):
     Args:
         transport: The transport term.
         scene: Particle mass.
-        target: Goal particles (M, 3), length units.
+        goal: Goal particles (M, 3), length units.
         start: Particles (N, 3) where the run begins, length units.
         density_weight: Weight of the misplaced mass beside the transport.
 
@@ -37,23 +37,23 @@ class ObjectiveShape(Objective):
     """
 
     def __init__(
-        self, transport: ObjectiveTransport, scene: Scene, target: Tensor, start: Tensor, *, density_weight: float = 1.0
+        self, transport: ObjectiveTransport, scene: Scene, goal: Tensor, start: Tensor, *, density_weight: float = 1.0
     ) -> None:
         if not 0.0 <= density_weight < float("inf"):
             raise InputError("density_weight", came=str(density_weight), expected="a finite number of at least 0")
         self._transport, self._weight, self._scene = transport, density_weight, scene
         self._scenes = [scene.model_copy(update={"grid_size": nodes}) for nodes in SCALES]
-        self._goals = [_shares(target.detach(), scale) for scale in self._scenes]
+        self._goals = [_shares(goal.detach(), scale) for scale in self._scenes]
         cost = float(transport.value(start.detach()))
         self._misplaced_start = float(self._misplaced(start.detach().unsqueeze(0))[0])
         self._cost_start = cost
         if not (cost > 0.0 and self._misplaced_start > 0.0):
             raise InputError("start", came="the goal itself", expected="a shape that differs from the goal")
 
-    def rebased(self, *, target: Tensor, start: Tensor) -> ObjectiveShape:
+    def rebased(self, *, goal: Tensor, start: Tensor) -> ObjectiveShape:
         """The same objective for another goal (M, 3) and another start (N, 3), length units, such as those at rest."""
-        transport = self._transport.with_target(target.to(self._transport.target))
-        return ObjectiveShape(transport, self._scene, target, start, density_weight=self._weight)
+        transport = self._transport.with_goal(goal.to(self._transport.goal))
+        return ObjectiveShape(transport, self._scene, goal, start, density_weight=self._weight)
 
     def evaluate(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> ObjectiveResult:
         """Loss and gradient of each world; the transport term is warm-started."""
@@ -65,11 +65,11 @@ class ObjectiveShape(Objective):
         factor = self._weight / self._misplaced_start
         gradient = result.grad_positions / self._cost_start
         gradient[:, -1] += factor * slope
-        poses = result.grad_manipulators
+        poses = result.grad_tools
         return ObjectiveResult(
             loss=result.loss / self._cost_start + factor * misplaced.detach().to(result.loss),
             grad_positions=gradient,
-            grad_manipulators=None if poses is None else poses / self._cost_start,
+            grad_tools=None if poses is None else poses / self._cost_start,
             warm=result.warm,
         )
 

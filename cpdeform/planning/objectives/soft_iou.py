@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cpdeform.core.objective import ObjectiveAutograd
 from cpdeform.core.scene import Scene
-from cpdeform.planning.objectives.density import check_target_grid
+from cpdeform.planning.objectives.density import check_goal_grid
 from cpdeform.planning.objectives.mass import mass_grid
 from cpdeform.planning.objectives.metrics import soft_iou
 
@@ -23,7 +23,7 @@ class ObjectiveSoftIoU(ObjectiveAutograd):
 
     Args:
         scene: Grid and particle mass.
-        target_grid: Node masses (G, G, G) of the goal, as `mass_grid` makes them.
+        goal_grid: Node masses (G, G, G) of the goal, as `mass_grid` makes them.
 
     Raises:
         InputError: The grid does not fit the scene, or holds no mass.
@@ -32,12 +32,12 @@ class ObjectiveSoftIoU(ObjectiveAutograd):
         Huang et al., "PlasticineLab: A Soft-Body Manipulation Benchmark with Differentiable Physics", ICLR 2021.
     """
 
-    def __init__(self, scene: Scene, target_grid: Tensor | NDArray[Any]) -> None:
-        self.scene, self.target_grid = scene, check_target_grid(target_grid, scene)
+    def __init__(self, scene: Scene, goal_grid: Tensor | NDArray[Any]) -> None:
+        self.scene, self.goal_grid = scene, check_goal_grid(goal_grid, scene)
 
-    def loss(self, positions: Tensor, manipulator_poses: Tensor) -> Tensor:
+    def loss(self, positions: Tensor, tool_poses: Tensor) -> Tensor:
         """Missing part (B,) of the soft IoU at the last step of positions (B, T+1, N, 3); the tools do not count."""
         mass = mass_grid(positions[:, -1].double(), self.scene)
-        target = self.target_grid.to(mass)
-        missing: Tensor = 1.0 - soft_iou(mass, target) / soft_iou(target, target)
+        goal = self.goal_grid.to(mass)
+        missing: Tensor = 1.0 - soft_iou(mass, goal) / soft_iou(goal, goal)
         return missing

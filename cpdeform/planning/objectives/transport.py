@@ -46,8 +46,8 @@ class ObjectiveTransport(Objective):
 
     Args:
         solver: Solves the transport problems.
-        target: Goal particles (M, 3), length units.
-        points: Solve on a fixed random subset of this many source and target particles; defaults to all of them. A cloud
+        goal: Goal particles (M, 3), length units.
+        points: Solve on a fixed random subset of this many source and goal particles; defaults to all of them. A cloud
             of fewer particles is used whole. Clouds of equal size share the subset, so that particles that correspond stay
             together.
         seed: Seed of the subset.
@@ -64,7 +64,7 @@ class ObjectiveTransport(Objective):
         scene: Whose tools the contact term is about; required with a `contact_weight`.
 
     Raises:
-        InputError: The target is not (M, 3), or an option is out of range.
+        InputError: The goal is not (M, 3), or an option is out of range.
 
     References:
         Li et al., "Contact Points Discovery for Soft-Body Manipulations with Differentiable Physics", ICLR 2022.
@@ -73,7 +73,7 @@ class ObjectiveTransport(Objective):
     def __init__(
         self,
         solver: OTSolver,
-        target: Tensor,
+        goal: Tensor,
         *,
         points: int | None = None,
         seed: int = 0,
@@ -84,8 +84,8 @@ class ObjectiveTransport(Objective):
         axis_scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
         scene: Scene | None = None,
     ) -> None:
-        if target.ndim != 2 or target.shape[1] != 3 or target.shape[0] == 0:
-            raise InputError("target", came=f"shape {tuple(target.shape)}", expected="shape (points, 3) with at least one point")
+        if goal.ndim != 2 or goal.shape[1] != 3 or goal.shape[0] == 0:
+            raise InputError("goal", came=f"shape {tuple(goal.shape)}", expected="shape (points, 3) with at least one point")
         for name, number in (("points", points), ("refresh", refresh)):
             if number is not None and number < 1:
                 raise InputError(name, came=str(number), expected="at least 1, or None")
@@ -96,7 +96,7 @@ class ObjectiveTransport(Objective):
             raise InputError("axis_scale", came=str(axis_scale), expected="three positive finite numbers")
         if contact_weight > 0.0 and scene is None:
             raise InputError("scene", came="None", expected="the scene", remedy="The contact term needs the shapes of its tools.")
-        self.solver, self.target, self.points, self.seed = solver, target.detach(), points, seed
+        self.solver, self.goal, self.points, self.seed = solver, goal.detach(), points, seed
         self.warm_start, self.refresh = warm_start and solver.capabilities.warm_start, refresh
         self.contact_weight, self.coast_steps, self.scene = contact_weight, coast_steps, scene
         self._scale = torch.tensor(axis_scale, dtype=torch.float64)
@@ -121,15 +121,15 @@ class ObjectiveTransport(Objective):
             grad_positions[:, -2] -= slope
         grad_poses = None
         if self.contact_weight > 0.0 and self.scene is not None:
-            contact, contact_positions, grad_poses = self._contact(self.scene, positions, trajectory.manipulator_poses.detach())
+            contact, contact_positions, grad_poses = self._contact(self.scene, positions, trajectory.tool_poses.detach())
             loss = loss + contact
             grad_positions += contact_positions
         return ObjectiveResult(loss, grad_positions, grad_poses, warm=entries if self.warm_start else None)
 
-    def with_target(self, target: Tensor) -> ObjectiveTransport:
+    def with_goal(self, goal: Tensor) -> ObjectiveTransport:
         """The same objective for other goal particles (M, 3), length units."""
         changed = copy.copy(self)
-        changed.target = target.detach()
+        changed.goal = goal.detach()
         return changed
 
     def value(self, positions: Tensor) -> Tensor:
@@ -158,38 +158,38 @@ class ObjectiveTransport(Objective):
 
     def _transport(self, final: Tensor, warm: list[_Warm] | None) -> tuple[Tensor, Tensor, tuple[_Warm, ...]]:
         """Cost (B,) and gradient (B, N, 3) of final positions (B, N, 3), and what the next evaluation can start from."""
-        source_index, target_index = (index.to(final.device) for index in self._subsets(final.shape[1]))
+        source_index, goal_index = (index.to(final.device) for index in self._subsets(final.shape[1]))
         scale = self._scale.to(final)
-        clouds, target = scale * final[:, source_index], scale * self.target.to(final)[target_index]
+        clouds, goal = scale * final[:, source_index], scale * self.goal.to(final)[goal_index]
         known = [entry.result for entry, cloud in zip(warm, final, strict=True) if entry.is_of(cloud)] if warm else []
         if warm is not None and len(known) == len(final):
             results, entries = known, tuple(warm)
         else:
-            results, entries = self._solve(clouds, target, final, warm)
+            results, entries = self._solve(clouds, goal, final, warm)
         gradient = torch.zeros_like(final)
         for world, result in enumerate(results):
             gradient[world, source_index] = scale * result.source_gradient.to(final)
         return torch.stack([result.value.to(final) for result in results]), gradient, entries
 
     def _solve(
-        self, clouds: Tensor, target: Tensor, final: Tensor, warm: list[_Warm] | None
+        self, clouds: Tensor, goal: Tensor, final: Tensor, warm: list[_Warm] | None
     ) -> tuple[list[OTResult], tuple[_Warm, ...]]:
-        """Solutions of clouds (B, n, 3) against the target (m, 3), warm-started where that may be."""
+        """Solutions of clouds (B, n, 3) against the goal (m, 3), warm-started where that may be."""
         if warm is None:
-            results = self.solver.solve_batch(clouds, target)
+            results = self.solver.solve_batch(clouds, goal)
             return results, tuple(_Warm(result, 0, cloud.clone()) for result, cloud in zip(results, final, strict=True))
         due = [self.refresh is not None and entry.calls > 0 and entry.calls % self.refresh == 0 for entry in warm]
         previous = [None if cold else entry.result for cold, entry in zip(due, warm, strict=True)]
-        results = self.solver.solve_batch(clouds, target, previous=previous)
+        results = self.solver.solve_batch(clouds, goal, previous=previous)
         return results, tuple(_Warm(result, entry.calls + 1) for result, entry in zip(results, warm, strict=True))
 
     def _subsets(self, source_count: int) -> tuple[Tensor, Tensor]:
-        """Sorted indices of the source and the target particles that the problem is solved on."""
-        target_count = self.target.shape[0]
+        """Sorted indices of the source and the goal particles that the problem is solved on."""
+        goal_count = self.goal.shape[0]
         source_index = self._subset(source_count, self.seed)
-        if target_count == source_count:
+        if goal_count == source_count:
             return source_index, source_index
-        return source_index, self._subset(target_count, self.seed + 1)
+        return source_index, self._subset(goal_count, self.seed + 1)
 
     def _subset(self, count: int, seed: int) -> Tensor:
         if self.points is None or self.points >= count:

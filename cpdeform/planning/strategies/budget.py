@@ -18,7 +18,7 @@ LONG_STAGE = 20
 
 def learning_rate(task: Task) -> float:
     """Adam's step size with which the first iteration, equal steps in one direction, moves no tool by more than `FIRST_MOVE`."""
-    speeds = [max(tool.action_scale[:3]) for tool in task.scene.manipulators if tool.movable]
+    speeds = [max(tool.action_scale[:3]) for tool in task.scene.tools if tool.movable]
     way = task.step_count * max(speeds, default=0.0)
     return LARGEST_STEP if way * LARGEST_STEP <= FIRST_MOVE else float(f"{FIRST_MOVE / way:.3g}")
 

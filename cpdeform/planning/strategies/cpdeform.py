@@ -31,5 +31,5 @@ class StrategyCpdeform(Strategy):
 
 def _proposers(task: Task) -> list[str]:
     """The proposers that the paper has for the scene's tools."""
-    movable = sum(tool.movable for tool in task.scene.manipulators)
+    movable = sum(tool.movable for tool in task.scene.tools)
     return ["direct"] if movable == 1 else ["left-right", "top-bottom", "front-back"]

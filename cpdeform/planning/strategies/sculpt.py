@@ -119,18 +119,18 @@ def from_rest(planner: Planner, start: Start) -> tuple[Planner, Start]:
     """
     simulator = planner.simulator
     first = rest(simulator, simulator.initial_state(batch_size=1)).state
-    target = _settled(simulator, start.target)
+    goal = _settled(simulator, start.goal)
     objective = planner.objective
     if isinstance(objective, ObjectiveShape):
-        objective = objective.rebased(target=target, start=first.position[0])
+        objective = objective.rebased(goal=goal, start=first.position[0])
     state = start.state if start.previous or start.first_stage else first
-    return dataclasses.replace(planner, objective=objective), dataclasses.replace(start, state=state, target=target)
+    return dataclasses.replace(planner, objective=objective), dataclasses.replace(start, state=state, goal=goal)
 
 
-def _settled(simulator: Simulator, target: Tensor) -> Tensor:
+def _settled(simulator: Simulator, goal: Tensor) -> Tensor:
     """The goal's particles (M, 3) where clay of its shape rests."""
-    if len(target) != simulator.scene.particle_count:
-        return target
-    settled = settle_goal(simulator, target)
+    if len(goal) != simulator.scene.particle_count:
+        return goal
+    settled = settle_goal(simulator, goal)
     near = 0.0 <= settled.drop <= MOST_CELLS / simulator.scene.grid_size
-    return settled.position.to(target) if near and settled.self_iou >= LEAST_SELF_IOU else target
+    return settled.position.to(goal) if near and settled.self_iou >= LEAST_SELF_IOU else goal

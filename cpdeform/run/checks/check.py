@@ -35,7 +35,7 @@ def check_task(task: Task) -> list[Finding]:
         InputError: A limit or the goal's file cannot be used.
     """
     task = limited_task(task)
-    clay, goal = sample_particles(task.scene), task.load_target()
+    clay, goal = sample_particles(task.scene), task.load_goal()
     return [
         *check_tools(task.scene),
         *check_near_bodies(task.scene),

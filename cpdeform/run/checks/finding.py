@@ -16,7 +16,7 @@ class Finding:
     Attributes:
         severity: How bad it is.
         kind: Which check found it, e.g. ``"tool thickness"``.
-        where: What of the task it is about, as a path of fields, e.g. ``"scene.manipulators.0"``.
+        where: What of the task it is about, as a path of fields, e.g. ``"scene.tools.0"``.
         what: What is found, with figures, one sentence.
         remedy: What to do about it, one sentence.
     """

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cpdeform.core.scene import WALL_NODES, ManipulatorChopsticks, Scene
+from cpdeform.core.scene import WALL_NODES, Scene, ToolChopsticks
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.core.state import manipulator_pose
+from cpdeform.core.state import tool_pose
 from cpdeform.run.checks.finding import Finding
 from cpdeform.run.checks.occupancy import solids
 
@@ -47,7 +47,7 @@ def check_goal_floating(scene: Scene, goal: NDArray[np.float64]) -> list[Finding
         Finding(
             "note" if held else "warning",
             "goal floating",
-            "target",
+            "goal",
             f"{share:.0%} of the goal hangs {span} above where clay rests, {floor_height(scene):.3g}, and "
             + ("only tools can hold it there." if held else "no tools can hold it there."),
             "Lower the goal by that much, or raise the floor (ground_height)"
@@ -69,7 +69,7 @@ def check_goal_below_floor(scene: Scene, clay: NDArray[np.float64], goal: NDArra
         Finding(
             "warning",
             "goal below the floor",
-            "target",
+            "goal",
             f"{share:.0%} of the goal's particles lie lower than clay can get: it comes to rest at a height of "
             f"{floor_height(scene):.3g}, {WALL_NODES} grid nodes above ground_height, and none starts lower than "
             f"{float(clay[:, 1].min()):.3g}.",
@@ -80,14 +80,14 @@ def check_goal_below_floor(scene: Scene, clay: NDArray[np.float64], goal: NDArra
 
 
 def _near_fixed_tool(scene: Scene, particles: NDArray[np.float64], distance: float) -> bool:
-    poses = manipulator_pose(scene)
+    poses = tool_pose(scene)
     return any(
         float(signed_distance(tool, poses[index], torch.as_tensor(particles)).min()) <= distance
-        for index, tool in enumerate(scene.manipulators)
+        for index, tool in enumerate(scene.tools)
         if not tool.movable
     )
 
 
 def _can_grip(scene: Scene) -> bool:
-    movable = [tool for tool in scene.manipulators if tool.movable]
-    return len(movable) > 1 or any(isinstance(tool, ManipulatorChopsticks) for tool in movable)
+    movable = [tool for tool in scene.tools if tool.movable]
+    return len(movable) > 1 or any(isinstance(tool, ToolChopsticks) for tool in movable)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cpdeform.core.scene import Manipulator, ManipulatorRollingPin, Scene
+from cpdeform.core.scene import Scene, Tool, ToolRollingPin
 from cpdeform.core.task import Task
 from cpdeform.run.checks.finding import Finding
 from cpdeform.run.checks.tool_size import bounding_radius, contact_reach
@@ -23,11 +23,9 @@ FAR = 99.0
 def check_goal_reach(task: Task, clay: NDArray[np.float64], goal: NDArray[np.float64]) -> list[Finding]:
     """Tell of a goal (M, 3) that the tools cannot bring the clay (N, 3) to, length units."""
     scene = task.scene
-    tools = [tool for tool in scene.manipulators if tool.movable]
+    tools = [tool for tool in scene.tools if tool.movable]
     if not tools:
-        return [
-            Finding("error", KIND, "scene.manipulators", "There is no tool that actions move.", "Give one tool an action_scale.")
-        ]
+        return [Finding("error", KIND, "scene.tools", "There is no tool that actions move.", "Give one tool an action_scale.")]
     from scipy.spatial import KDTree
 
     distance = KDTree(clay).query(goal)[0]
@@ -41,7 +39,7 @@ def check_goal_reach(task: Task, clay: NDArray[np.float64], goal: NDArray[np.flo
                 Finding(
                     "warning",
                     KIND,
-                    "scene.manipulators",
+                    "scene.tools",
                     f"{outside:.0%} of the goal's particles that lie away from the clay are where no tool comes: "
                     "lower_bound and upper_bound keep the tools' positions from it.",
                     "Widen the bounds, or move the goal.",
@@ -61,16 +59,16 @@ def check_goal_reach(task: Task, clay: NDArray[np.float64], goal: NDArray[np.flo
     return findings
 
 
-def _reached(scene: Scene, tool: Manipulator, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _reached(scene: Scene, tool: Tool, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which points (P, 3) a tool may touch, wherever within its bounds it is."""
     reach = bounding_radius(tool) + contact_reach(scene)
     lower, upper = np.asarray(tool.lower_bound) - reach, np.asarray(tool.upper_bound) + reach
     return np.asarray(((points >= lower) & (points <= upper)).all(axis=1))
 
 
-def _travel(tool: Manipulator) -> float:
+def _travel(tool: Tool) -> float:
     """The farthest that clay at a tool's surface can be carried in an environment step, length units."""
     scale = tool.action_scale
-    if isinstance(tool, ManipulatorRollingPin):
+    if isinstance(tool, ToolRollingPin):
         return math.hypot(scale[0] * ROLLING_RADIUS, scale[2]) + scale[1] * bounding_radius(tool)
     return math.hypot(*scale[:3]) + (math.hypot(*scale[3:6]) * bounding_radius(tool) if len(scale) > 3 else 0.0)

@@ -34,7 +34,7 @@ def check_goal_volume(clay: NDArray[np.float64], goal: NDArray[np.float64]) -> l
         Finding(
             "warning",
             KIND,
-            "target",
+            "goal",
             f"The goal fills about {wanted:.3g} (in domain edges cubed), {abs(difference):.0%} "
             f"{'more' if difference > 0 else 'less'} than the clay's {there:.3g}; clay hardly changes its volume.",
             f"Scale the goal's lengths by {(1.0 / (1.0 + difference)) ** (1.0 / 3.0):.3g}, or change the bodies.",

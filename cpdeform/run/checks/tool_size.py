@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 
-from cpdeform.core.scene import Manipulator, Scene
+from cpdeform.core.scene import Scene, Tool
 from cpdeform.placement.tool import tool_half_extents
 
 LEAST_INFLUENCE = 0.1
@@ -23,11 +23,11 @@ def contact_reach(scene: Scene) -> float:
     return -math.log(LEAST_INFLUENCE) / scene.softness if scene.softness > 0.0 else 0.0
 
 
-def thickness(tool: Manipulator) -> float:
+def thickness(tool: Tool) -> float:
     """Width of a tool across its thinnest direction, length units."""
     return 2.0 * float(tool_half_extents(tool, torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)).min())
 
 
-def bounding_radius(tool: Manipulator) -> float:
+def bounding_radius(tool: Tool) -> float:
     """Distance of a tool's farthest point from its local origin, length units, to a thousandth."""
     return float(np.linalg.norm(tool.shape().surface(rows=SURFACE_POINTS, columns=SURFACE_POINTS), axis=-1).max())

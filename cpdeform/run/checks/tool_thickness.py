@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from cpdeform.core.scene import Manipulator, Scene
+from cpdeform.core.scene import Scene, Tool
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.core.state import manipulator_pose
+from cpdeform.core.state import tool_pose
 from cpdeform.run.checks.finding import Finding
 from cpdeform.run.checks.tool_size import bounding_radius, contact_reach, thickness
 
@@ -21,8 +21,8 @@ def check_tool_thickness(scene: Scene) -> list[Finding]:
     A tool acts at the grid's nodes up to `contact_reach` from its surface, and nowhere else.
     """
     findings = []
-    for index, tool in enumerate(scene.manipulators):
-        where, least = f"scene.manipulators.{index}", LEAST_NODES * scene.node_distance - 2.0 * contact_reach(scene)
+    for index, tool in enumerate(scene.tools):
+        where, least = f"scene.tools.{index}", LEAST_NODES * scene.node_distance - 2.0 * contact_reach(scene)
         if not tool.movable and felt_nodes(scene, index) == 0:
             findings.append(
                 Finding(
@@ -51,12 +51,12 @@ def check_tool_thickness(scene: Scene) -> list[Finding]:
 
 def felt_nodes(scene: Scene, index: int) -> int:
     """Number of the grid's nodes that a tool acts at in its start pose."""
-    tool, pose = scene.manipulators[index], manipulator_pose(scene)[index]
+    tool, pose = scene.tools[index], tool_pose(scene)[index]
     nodes = _nodes_near(scene, tool, pose[:3])
     return int((signed_distance(tool, pose, nodes) <= contact_reach(scene)).sum())
 
 
-def _nodes_near(scene: Scene, tool: Manipulator, centre: torch.Tensor) -> torch.Tensor:
+def _nodes_near(scene: Scene, tool: Tool, centre: torch.Tensor) -> torch.Tensor:
     """Positions (K, 3) of the grid's nodes in a box around a tool, length units."""
     reach = bounding_radius(tool) + contact_reach(scene)
     axes = []

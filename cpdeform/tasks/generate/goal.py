@@ -15,10 +15,10 @@ import torch
 from numpy.typing import NDArray
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.goal import write_goal
 from cpdeform.core.plugins import AUTO, Registry, load_registry
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import Simulator
-from cpdeform.core.target import write_target
 from cpdeform.core.task import Task
 from cpdeform.planning.rest import rest, rest_scene, rest_state, settle_goal
 from cpdeform.tasks.generate.layouts import is_rope, random_cubes, random_rope
@@ -70,7 +70,7 @@ class GeneratedGoal:
         """
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_target(path, self.position, corresponds=self.corresponds)
+            write_goal(path, self.position, corresponds=self.corresponds)
         except OSError as error:
             came = f"a path that cannot be written ({error.strerror or error})"
             raise InputError(f"goal file {path}", came=came, expected="a writable path") from error
@@ -116,7 +116,7 @@ class _Maker:
 
     def make(self, name: str, rng: np.random.Generator) -> Drawn:
         """A goal for the task of that name."""
-        scene, tool = self._scene, self._scene.manipulators[0] if self._scene.manipulators else None
+        scene, tool = self._scene, self._scene.tools[0] if self._scene.tools else None
         if name in SCRIPTS:
             return self._performed("a variation of the script", script_motion(scene, name, rng))
         if len(scene.bodies) > 1:
@@ -125,7 +125,7 @@ class _Maker:
             return self._put_down("rope", random_rope(scene, rng))
         if tool is not None and tool.kind == "Capsule":
             return self._performed(*pen_motion(scene, rng))
-        if tool is not None and tool.kind == "Sphere" and len(scene.manipulators) == 1:
+        if tool is not None and tool.kind == "Sphere" and len(scene.tools) == 1:
             return self._performed(*dent_motion(scene, rng))
         return self._solid(rng)
 

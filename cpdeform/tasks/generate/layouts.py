@@ -11,7 +11,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.sampling import sample_particles
 from cpdeform.core.scene import BodyBox, Scene
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.core.state import manipulator_pose
+from cpdeform.core.state import tool_pose
 from cpdeform.tasks.rearrangements import bent_rope, shifted_bodies
 
 Array = NDArray[np.float64]
@@ -95,8 +95,8 @@ def _has_room(position: Array, scene: Scene) -> bool:
     aside = position[:, [0, 2]]
     if aside.min() < MARGIN or aside.max() > 1.0 - MARGIN:
         return False
-    points, poses = torch.as_tensor(position), manipulator_pose(scene)
-    fixed = [(tool, poses[index]) for index, tool in enumerate(scene.manipulators) if not tool.movable]
+    points, poses = torch.as_tensor(position), tool_pose(scene)
+    fixed = [(tool, poses[index]) for index, tool in enumerate(scene.tools) if not tool.movable]
     return all(float(signed_distance(tool, pose, points).min()) > 0.0 for tool, pose in fixed)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.scene import Body, ManipulatorSphere, Scene, Vector3
+from cpdeform.core.scene import Body, Scene, ToolSphere, Vector3
 from cpdeform.tasks.letters import LETTERS, Polyline, draw
 from cpdeform.tasks.scripts import Leg
 from cpdeform.tasks.single_stage import SCRIPTS
@@ -53,7 +53,7 @@ def pen_motion(scene: Scene, rng: np.random.Generator) -> tuple[str, list[Leg]]:
     Returns:
         What is written, and the motion.
     """
-    board, pen = scene.bodies[0], scene.manipulators[0]
+    board, pen = scene.bodies[0], scene.tools[0]
     length, depth_of_board = 2.0 * board.half_extents[0] - 0.16, 2.0 * board.half_extents[2] - 0.1
     reach = 0.5 * getattr(pen, "height", 0.0) + getattr(pen, "radius", 0.03)
     pen_height = board.position[1] + board.half_extents[1] + reach + 0.001
@@ -109,9 +109,9 @@ def dent_motion(scene: Scene, rng: np.random.Generator) -> tuple[str, list[Leg]]
     Raises:
         InputError: The first tool is no ball.
     """
-    block, ball = scene.bodies[0], scene.manipulators[0]
-    if not isinstance(ball, ManipulatorSphere):
-        raise InputError("scene.manipulators.0", came=f"a {ball.kind}", expected="a Sphere, the ball")
+    block, ball = scene.bodies[0], scene.tools[0]
+    if not isinstance(ball, ToolSphere):
+        raise InputError("scene.tools.0", came=f"a {ball.kind}", expected="a Sphere, the ball")
     contacts: list[list[float]] = []
     legs: list[Leg] = []
     count = int(rng.integers(3, 6))

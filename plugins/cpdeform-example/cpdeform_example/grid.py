@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.rotation import rotate, rotate_inverse
-from cpdeform.core.scene import WALL_NODES, Manipulator, Scene
+from cpdeform.core.scene import WALL_NODES, Scene, Tool
 from cpdeform_example.motion import surface_velocity
 from cpdeform_example.shapes import distance_and_normal
 from cpdeform_example.transfer import Stencil
@@ -33,16 +33,16 @@ def update_grid(scene: Scene, stencil: Stencil, momentum: Tensor, mass: Tensor, 
     velocity = velocity + scene.time_step * velocity.new_tensor(scene.gravity)
     # converted first: whole numbers times a Python float are float32 in torch
     node = stencil.numbers.to(velocity) * scene.node_distance
-    for index, manipulator in enumerate(scene.manipulators):
+    for index, tool in enumerate(scene.tools):
         poses = before[stencil.worlds, index], after[stencil.worlds, index]
-        velocity = contact(scene, manipulator, *poses, node, velocity)
+        velocity = contact(scene, tool, *poses, node, velocity)
     return torch.where(occupied, boundary(scene, stencil.numbers, velocity), 0.0)
 
 
-def contact(scene: Scene, manipulator: Manipulator, before: Tensor, after: Tensor, node: Tensor, velocity: Tensor) -> Tensor:
+def contact(scene: Scene, tool: Tool, before: Tensor, after: Tensor, node: Tensor, velocity: Tensor) -> Tensor:
     """Velocities (K, 3) after contact with one tool, whose poses (K, 8) are those of each node's world."""
     local = rotate_inverse(before[:, 3:7], node - before[:, :3])
-    distance, local_normal = distance_and_normal(manipulator, local, before[:, 7:])
+    distance, local_normal = distance_and_normal(tool, local, before[:, 7:])
     # 1 inside. Clamped before the exponential, which could overflow inside a large tool.
     influence = torch.exp(-scene.softness * distance.clamp(min=0.0))
     touches = (distance <= 0.0) | ((scene.softness > 0.0) & (influence > SMALLEST_INFLUENCE))
@@ -52,7 +52,7 @@ def contact(scene: Scene, manipulator: Manipulator, before: Tensor, after: Tenso
     approach = (relative * normal).sum(dim=-1, keepdim=True)
     tangent = relative - approach * normal
     norm = (tangent.square().sum(dim=-1, keepdim=True) + NORM_REGULARIZATION).sqrt()
-    sliding = tangent * ((norm + manipulator.friction * approach).clamp(min=0.0) / norm)
+    sliding = tangent * ((norm + tool.friction * approach).clamp(min=0.0) / norm)
     stopped = torch.where(approach < 0.0, sliding, relative)
     return torch.where(touches, tool_velocity + (1.0 - influence) * relative + influence * stopped, velocity)
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.rotation import from_rotation_vector, multiply, rotate
-from cpdeform.core.scene import Manipulator, ManipulatorChopsticks, ManipulatorRollingPin, Scene
+from cpdeform.core.scene import Scene, Tool, ToolChopsticks, ToolRollingPin
 
 ROLLING_RADIUS = 0.03
 """How far a rolling pin rolls a radian, length units; not its radius (PlasticineLab's quirk)."""
@@ -20,35 +20,35 @@ def move_tools(scene: Scene, poses: Tensor, action: Tensor) -> Tensor:
 
     Args:
         scene: Whose tools they are.
-        poses: Poses (B, M, 8) before, see `State.manipulator_pose`.
+        poses: Poses (B, M, 8) before, see `State.tool_pose`.
         action: One environment step's action (B, A) in [-1, 1].
 
     Returns:
         Poses (B, M, 8) after.
     """
     moved, first = [], 0
-    for index, manipulator in enumerate(scene.manipulators):
-        size = manipulator.action_size
-        scale = action.new_tensor(manipulator.action_scale) / scene.substeps
-        moved.append(_move(manipulator, poses[:, index], action[:, first : first + size] * scale))
+    for index, tool in enumerate(scene.tools):
+        size = tool.action_size
+        scale = action.new_tensor(tool.action_scale) / scene.substeps
+        moved.append(_move(tool, poses[:, index], action[:, first : first + size] * scale))
         first += size
     return torch.stack(moved, dim=1) if moved else poses
 
 
-def _move(manipulator: Manipulator, pose: Tensor, motion: Tensor) -> Tensor:
+def _move(tool: Tool, pose: Tensor, motion: Tensor) -> Tensor:
     """Move one tool (B, 8) by a substep's motion (B, `action_size`): length units and radians."""
-    if manipulator.action_size == 0:
+    if tool.action_size == 0:
         return pose
     position, rotation, gap = pose[:, :3], pose[:, 3:7], pose[:, 7:]
     displacement = motion[:, :3]
-    if isinstance(manipulator, ManipulatorRollingPin):
+    if isinstance(tool, ToolRollingPin):
         displacement, rotation = _roll(rotation, motion)
-    elif isinstance(manipulator, ManipulatorChopsticks):
+    elif isinstance(tool, ToolChopsticks):
         rotation = multiply(rotation, from_rotation_vector(motion[:, 3:6]))
         gap = (gap - motion[:, 6:]).clamp(min=SMALLEST_GAP)
-    elif manipulator.action_size >= 6:
+    elif tool.action_size >= 6:
         rotation = multiply(from_rotation_vector(motion[:, 3:6]), rotation)
-    lower, upper = pose.new_tensor(manipulator.lower_bound), pose.new_tensor(manipulator.upper_bound)
+    lower, upper = pose.new_tensor(tool.lower_bound), pose.new_tensor(tool.upper_bound)
     return torch.cat([(position + displacement).clamp(lower, upper), rotation, gap], dim=-1)
 
 

@@ -30,7 +30,7 @@ class ProposerAbove(Proposer):
         if contact is None:
             return []
         scene, poses, index = search.exploration.stage.scene, search.poses, search.movable[0]
-        tool, up, start = scene.manipulators[index], poses.new_tensor([0.0, 1.0, 0.0]), search.particles[contact]
+        tool, up, start = scene.tools[index], poses.new_tensor([0.0, 1.0, 0.0]), search.particles[contact]
         height = exit_distances(tool, poses[index, 3:7], start.unsqueeze(0), up, search.particles, reach=REACH)[0]
         poses[index, :3] = start + height * up
         if not bool(torch.isfinite(height)) or bool((poses[index, :3] > poses.new_tensor(tool.upper_bound)).any()):

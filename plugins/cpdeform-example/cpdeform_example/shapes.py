@@ -7,30 +7,30 @@ from torch import Tensor
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.scene import (
-    Manipulator,
-    ManipulatorBox,
-    ManipulatorChopsticks,
-    ManipulatorCylinder,
-    ManipulatorRod,
-    ManipulatorSphere,
-    ManipulatorTorus,
+    Tool,
+    ToolBox,
+    ToolChopsticks,
+    ToolCylinder,
+    ToolRod,
+    ToolSphere,
+    ToolTorus,
 )
 
 LENGTH_REGULARIZATION = 1e-8
 """Added to squared lengths (PlasticineLab's quirk). It keeps the gradient at zero finite, and it is part of the model: the
 distances of `cpdeform.core.signed_distance`, made for placing tools, do without and differ by about 1e-7."""
 
-MANIPULATOR_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
 
 
-def distance_and_normal(manipulator: Manipulator, local: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
+def distance_and_normal(tool: Tool, local: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
     """A tool's surface as points see it.
 
     The normals are written out instead of left to autograd: they are differentiated once more, and at an edge that two faces
     share they choose one face, as the other backends do.
 
     Args:
-        manipulator: The tool; only its shape counts.
+        tool: The tool; only its shape counts.
         local: Points (K, 3) in its frame, length units.
         gap: Gap (K, 1) of the tool, where it has one; length units.
 
@@ -38,26 +38,26 @@ def distance_and_normal(manipulator: Manipulator, local: Tensor, gap: Tensor) ->
         Signed distances (K, 1), negative inside, and outward unit normals (K, 3).
 
     Raises:
-        InputError: The kind is not one of `MANIPULATOR_KINDS`.
+        InputError: The kind is not one of `TOOL_KINDS`.
     """
-    match manipulator:
-        case ManipulatorSphere():
-            return _around(local, manipulator.radius)
-        case ManipulatorRod():
-            return _rod(manipulator, local)
-        case ManipulatorChopsticks():
+    match tool:
+        case ToolSphere():
+            return _around(local, tool.radius)
+        case ToolRod():
+            return _rod(tool, local)
+        case ToolChopsticks():
             aside = 0.5 * gap * _sign(local[:, :1])
-            centre = torch.cat([aside, torch.full_like(gap, -0.5 * manipulator.height), torch.zeros_like(gap)], dim=-1)
-            return _rod(manipulator, local - centre)
-        case ManipulatorBox():
-            return _box(manipulator, local)
-        case ManipulatorCylinder():
-            return _cylinder(manipulator, local)
-        case ManipulatorTorus():
+            centre = torch.cat([aside, torch.full_like(gap, -0.5 * tool.height), torch.zeros_like(gap)], dim=-1)
+            return _rod(tool, local - centre)
+        case ToolBox():
+            return _box(tool, local)
+        case ToolCylinder():
+            return _cylinder(tool, local)
+        case ToolTorus():
             radial, radius = _radial(local)
             height = local * local.new_tensor([0.0, 1.0, 0.0])
-            return _around((radius - manipulator.major_radius) * radial + height, manipulator.tube_radius)
-    raise InputError("manipulator", came=type(manipulator).__name__, expected=f"one of the kinds {', '.join(MANIPULATOR_KINDS)}")
+            return _around((radius - tool.major_radius) * radial + height, tool.tube_radius)
+    raise InputError("tool", came=type(tool).__name__, expected=f"one of the kinds {', '.join(TOOL_KINDS)}")
 
 
 def _around(offset: Tensor, radius: float) -> tuple[Tensor, Tensor]:
@@ -66,14 +66,14 @@ def _around(offset: Tensor, radius: float) -> tuple[Tensor, Tensor]:
     return length - radius, offset / length
 
 
-def _rod(manipulator: ManipulatorRod | ManipulatorChopsticks, local: Tensor) -> tuple[Tensor, Tensor]:
-    half = 0.5 * manipulator.height
+def _rod(tool: ToolRod | ToolChopsticks, local: Tensor) -> tuple[Tensor, Tensor]:
+    half = 0.5 * tool.height
     x, y, z = local.unbind(-1)
-    return _around(torch.stack([x, y - y.clamp(-half, half), z], dim=-1), manipulator.radius)
+    return _around(torch.stack([x, y - y.clamp(-half, half), z], dim=-1), tool.radius)
 
 
-def _box(manipulator: ManipulatorBox, local: Tensor) -> tuple[Tensor, Tensor]:
-    half = local.new_tensor(manipulator.half_extents)
+def _box(tool: ToolBox, local: Tensor) -> tuple[Tensor, Tensor]:
+    half = local.new_tensor(tool.half_extents)
     excess = local.abs() - half
     nearest, axis = excess.max(dim=-1, keepdim=True)
     outside = nearest > 0.0
@@ -82,14 +82,14 @@ def _box(manipulator: ManipulatorBox, local: Tensor) -> tuple[Tensor, Tensor]:
     length = offset.square().sum(dim=-1, keepdim=True).sqrt()
     face = torch.zeros_like(local).scatter(-1, axis, _sign(local.gather(-1, axis)))
     distance = torch.where(outside, length, nearest)
-    return distance - manipulator.rounding, torch.where(outside, offset / length, face)
+    return distance - tool.rounding, torch.where(outside, offset / length, face)
 
 
-def _cylinder(manipulator: ManipulatorCylinder, local: Tensor) -> tuple[Tensor, Tensor]:
+def _cylinder(tool: ToolCylinder, local: Tensor) -> tuple[Tensor, Tensor]:
     radial, radius = _radial(local)
     height = local[:, 1:2]
     up = torch.cat([torch.zeros_like(height), _sign(height), torch.zeros_like(height)], dim=-1)
-    side, top = radius - manipulator.radius, height.abs() - manipulator.half_height
+    side, top = radius - tool.radius, height.abs() - tool.half_height
     corner = (side > 0.0) & (top > 0.0)
     length = torch.where(corner, side.square() + top.square(), 1.0).sqrt()
     face = torch.where(side > top, radial, up)

@@ -17,7 +17,7 @@ from cpdeform.core.state import State
 from cpdeform_example.grid import update_grid
 from cpdeform_example.material import Material
 from cpdeform_example.motion import move_tools
-from cpdeform_example.shapes import MANIPULATOR_KINDS
+from cpdeform_example.shapes import TOOL_KINDS
 from cpdeform_example.transfer import grid_to_particles, make_stencil, particles_to_grid
 
 NUMBERS_PER_PARTICLE, NUMBERS_PER_NODE, NUMBERS_PER_CONTACT = 900, 20, 80
@@ -34,7 +34,7 @@ class SimulatorExample(Simulator):
         dtype: `torch.float64` (default) or `torch.float32`.
 
     Raises:
-        CapabilityError: The device, type or a manipulator is not supported.
+        CapabilityError: The device, type or a tool is not supported.
         InputError: `batch_size` is below 1.
     """
 
@@ -42,7 +42,7 @@ class SimulatorExample(Simulator):
         differentiable=True,
         devices=("cpu",),
         dtypes=(torch.float64, torch.float32),
-        manipulator_kinds=MANIPULATOR_KINDS,
+        tool_kinds=TOOL_KINDS,
         deterministic_devices=("cpu",),
     )
 
@@ -55,13 +55,13 @@ class SimulatorExample(Simulator):
     def _substep(self, state: State, action: Tensor) -> State:
         """The state after one substep; every operation is one that autograd knows."""
         scene, mass = self.scene, self.scene.particle_volume  # density is 1
-        poses = move_tools(scene, state.manipulator_pose, action)
+        poses = move_tools(scene, state.tool_pose, action)
         strain, stress = self._material.respond(state.elastic_strain, state.affine, scene.time_step)
         push = -scene.time_step * scene.particle_volume * 4.0 / scene.node_distance**2
         affine = scene.node_distance * (push * stress + mass * state.affine)
         stencil = make_stencil(state.position, scene.grid_size)
         momentum, node_mass = particles_to_grid(stencil, mass * state.velocity, affine, mass)
-        node_velocity = update_grid(scene, stencil, momentum, node_mass, state.manipulator_pose, poses)
+        node_velocity = update_grid(scene, stencil, momentum, node_mass, state.tool_pose, poses)
         velocity, affine = grid_to_particles(stencil, node_velocity, scene.grid_size)
         lower, upper = (velocity.new_tensor(corner) for corner in scene.domain)
         position = (state.position + scene.time_step * velocity).clamp(lower, upper)
@@ -83,7 +83,7 @@ class SimulatorExample(Simulator):
                 states.append(self._step(states[-1], action))
         return Trajectory(
             positions=torch.stack([each.position for each in states], dim=1),
-            manipulator_poses=torch.stack([each.manipulator_pose for each in states], dim=1),
+            tool_poses=torch.stack([each.tool_pose for each in states], dim=1),
             actions=actions.clone(),
             initial_state=states[0].clone(),
             final_state=states[-1],
@@ -94,14 +94,14 @@ class SimulatorExample(Simulator):
         self,
         trajectory: Trajectory,
         grad_positions: Tensor,
-        grad_manipulators: Tensor | None = None,
+        grad_tools: Tensor | None = None,
         *,
         grad_final_state: State | None = None,
     ) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
-        _check_gradients(trajectory, grad_positions, grad_manipulators)
+        _check_gradients(trajectory, grad_positions, grad_tools)
         check_final_gradient(trajectory, grad_final_state)
-        grad_poses = torch.zeros_like(trajectory.manipulator_poses) if grad_manipulators is None else grad_manipulators
+        grad_poses = torch.zeros_like(trajectory.tool_poses) if grad_tools is None else grad_tools
         last = trajectory.step_count
         actions, starts = trajectory.checkpoints
         grad_actions = torch.zeros_like(actions)
@@ -132,7 +132,7 @@ class SimulatorExample(Simulator):
         scene = self.scene
         nodes = sum(_touched_nodes(scene, body) for body in scene.bodies)
         substep = scene.particle_count * NUMBERS_PER_PARTICLE
-        substep += nodes * (NUMBERS_PER_NODE + NUMBERS_PER_CONTACT * len(scene.manipulators))
+        substep += nodes * (NUMBERS_PER_NODE + NUMBERS_PER_CONTACT * len(scene.tools))
         # a checkpoint, and snapshots of the positions in the trajectory and in its gradient
         checkpoint = scene.particle_count * (3 + 3 + 9 + 6 + 2 * 3)
         return (worlds or self.batch_size) * self.dtype.itemsize * (scene.substeps * substep + (step_count + 1) * checkpoint)
@@ -147,18 +147,18 @@ def _touched_nodes(scene: Scene, body: Body) -> int:
 def _add(grad: State, positions: Tensor, poses: Tensor) -> State:
     """Add the gradient of a step's snapshots to that of its state."""
     position = grad.position + positions.to(grad.position)
-    return dataclasses.replace(grad, position=position, manipulator_pose=grad.manipulator_pose + poses.to(grad.manipulator_pose))
+    return dataclasses.replace(grad, position=position, tool_pose=grad.tool_pose + poses.to(grad.tool_pose))
 
 
 def _tensors(state: State) -> tuple[Tensor, ...]:
     return tuple(getattr(state, field.name) for field in dataclasses.fields(state))
 
 
-def _check_gradients(trajectory: Trajectory, positions: Tensor, manipulators: Tensor | None) -> None:
+def _check_gradients(trajectory: Trajectory, positions: Tensor, tools: Tensor | None) -> None:
     """Raise `InputError` unless the gradients fit a trajectory that can be pulled back."""
     if not isinstance(trajectory.checkpoints, tuple):
         raise InputError("trajectory", came="a trajectory without checkpoints", expected="one made by this simulator's rollout")
-    pairs = {"grad_positions": (positions, trajectory.positions), "grad_manipulators": (manipulators, trajectory.manipulator_poses)}
+    pairs = {"grad_positions": (positions, trajectory.positions), "grad_tools": (tools, trajectory.tool_poses)}
     for name, (grad, like) in pairs.items():
         if grad is not None and grad.shape != like.shape:
             raise InputError(name, came=f"shape {tuple(grad.shape)}", expected=f"shape {tuple(like.shape)}")

@@ -14,13 +14,13 @@ from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import differentiable_rollout
 from cpdeform_example.simulator import SimulatorExample
 
-FIELDS = ("position", "velocity", "affine", "elastic_strain", "manipulator_pose")
+FIELDS = ("position", "velocity", "affine", "elastic_strain", "tool_pose")
 
 
 def scene(**changes: Any) -> Scene:
     body = {"kind": "box", "position": (0.5, 0.06, 0.5), "widths": (0.12, 0.1, 0.12), "particle_count": 80}
     capsule = {"kind": "Capsule", "radius": 0.03, "height": 0.06, "position": (0.47, 0.14, 0.5), "action_scale": (0.02,) * 6}
-    return Scene.model_validate({"bodies": [body], "manipulators": [capsule], "grid_size": 32, "substeps": 3, **changes})
+    return Scene.model_validate({"bodies": [body], "tools": [capsule], "grid_size": 32, "substeps": 3, **changes})
 
 
 def plan(batch_size: int = 1, steps: int = 2) -> Tensor:
@@ -47,7 +47,7 @@ def test_gradient_from_rest_equals_finite_differences() -> None:
 @pytest.mark.parametrize("gravity", [0.0, -1.0])
 def test_gradients_are_finite_from_rest_and_zero_without_contact(gravity: float) -> None:
     far = {"kind": "Box", "half_extents": (0.02,) * 3, "position": (0.5, 0.5, 0.5), "action_scale": (0.02,) * 6}
-    simulator = SimulatorExample(scene(manipulators=[far], gravity_parameter=(0.0, gravity, 0.0)))
+    simulator = SimulatorExample(scene(tools=[far], gravity_parameter=(0.0, gravity, 0.0)))
     trajectory = simulator.rollout(simulator.initial_state(), torch.zeros(1, 2, 6))
     gradient = simulator.vjp(trajectory, torch.ones_like(trajectory.positions))
     assert torch.equal(gradient.actions, torch.zeros_like(gradient.actions))

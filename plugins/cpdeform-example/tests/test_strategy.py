@@ -22,11 +22,11 @@ def task(tmp_path: Path) -> Task:
     """A block and a ball above it; the goal is what a press from above makes."""
     body = {"kind": "box", "position": (0.5, 0.15, 0.5), "widths": (0.12, 0.1, 0.12), "particle_count": 100}
     ball = {"kind": "Sphere", "radius": 0.04, "position": (0.5, 0.245, 0.5), "action_scale": (0.01,) * 3}
-    scene = {"bodies": [body], "manipulators": [ball], "grid_size": 32, "substeps": 5, "ground_height": 0.05}
-    task = Task.model_validate({"name": "press", "scene": scene, "target": tmp_path / "goal.npz", "step_count": 4})
+    scene = {"bodies": [body], "tools": [ball], "grid_size": 32, "substeps": 5, "ground_height": 0.05}
+    task = Task.model_validate({"name": "press", "scene": scene, "goal": tmp_path / "goal.npz", "step_count": 4})
     simulator = SimulatorExample(task.scene)
     press = torch.tensor([0.0, -1.0, 0.0]).repeat(1, 4, 1)
-    np.savez(task.target, position=simulator.rollout(simulator.initial_state(), press).positions[0, -1].numpy())
+    np.savez(task.goal, position=simulator.rollout(simulator.initial_state(), press).positions[0, -1].numpy())
     return task
 
 

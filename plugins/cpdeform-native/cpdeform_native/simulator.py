@@ -23,7 +23,7 @@ except ImportError as error:
         "simulator", "native", module="cpdeform_native._simulator", install="pip install cpdeform-native"
     ) from error
 
-MANIPULATOR_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
 """The kinds of tools that the C++ knows."""
 
 
@@ -45,7 +45,7 @@ class SimulatorNative(SimulatorCheckpointing):
         instruction_set: ``"baseline"``, ``"avx2"`` or ``"avx512"``; defaults to the fastest that the processor has.
 
     Raises:
-        CapabilityError: The device, type or a manipulator is not supported.
+        CapabilityError: The device, type or a tool is not supported.
         InputError: An option is out of range, or the processor lacks the instruction set.
     """
 
@@ -53,7 +53,7 @@ class SimulatorNative(SimulatorCheckpointing):
         differentiable=True,
         devices=("cpu",),
         dtypes=(torch.float32, torch.float64),
-        manipulator_kinds=MANIPULATOR_KINDS,
+        tool_kinds=TOOL_KINDS,
         deterministic_devices=("cpu",),
     )
 
@@ -69,10 +69,8 @@ class SimulatorNative(SimulatorCheckpointing):
         instruction_set: str | None = None,
     ) -> None:
         super().__init__(scene, batch_size=batch_size, device=device, dtype=dtype, threads=threads, memory_budget=memory_budget)
-        if len(scene.manipulators) > _simulator.MAX_TOOLS:
-            raise CapabilityError(
-                f"SimulatorNative has at most {_simulator.MAX_TOOLS} manipulators, not {len(scene.manipulators)}."
-            )
+        if len(scene.tools) > _simulator.MAX_TOOLS:
+            raise CapabilityError(f"SimulatorNative has at most {_simulator.MAX_TOOLS} tools, not {len(scene.tools)}.")
         known = _simulator.instruction_sets()
         if instruction_set is not None and instruction_set not in known:
             raise InputError(
@@ -91,7 +89,7 @@ class SimulatorNative(SimulatorCheckpointing):
         """Simulate T environment steps; see `Simulator.rollout`."""
         self.check_inputs(state, actions)
         state, actions = state.map(self._own), self._own(actions)
-        worlds, steps, tools = state.batch_size, actions.shape[1], state.manipulator_pose.shape[1]
+        worlds, steps, tools = state.batch_size, actions.shape[1], state.tool_pose.shape[1]
         positions = torch.empty(worlds, steps + 1, state.particle_count, 3, dtype=self.dtype)
         poses = torch.empty(worlds, steps + 1, tools, 8, dtype=self.dtype)
         velocity, affine, strain = (torch.empty_like(value) for value in (state.velocity, state.affine, state.elastic_strain))
@@ -103,7 +101,7 @@ class SimulatorNative(SimulatorCheckpointing):
                 state.velocity,
                 state.affine,
                 state.elastic_strain,
-                state.manipulator_pose,
+                state.tool_pose,
                 actions,
                 positions,
                 poses,
@@ -116,7 +114,7 @@ class SimulatorNative(SimulatorCheckpointing):
         final = State(positions[:, -1].clone(), velocity, affine, strain, poses[:, -1].clone())
         return Trajectory(
             positions=positions,
-            manipulator_poses=poses,
+            tool_poses=poses,
             actions=actions.clone(),
             initial_state=state,
             final_state=final,
@@ -127,18 +125,18 @@ class SimulatorNative(SimulatorCheckpointing):
         self,
         trajectory: Trajectory,
         grad_positions: Tensor,
-        grad_manipulators: Tensor | None = None,
+        grad_tools: Tensor | None = None,
         *,
         grad_final_state: State | None = None,
     ) -> RolloutGradient:
         """Pull gradients back through a rollout; see `Simulator.vjp`."""
-        positions, poses, final = self._incoming(trajectory, grad_positions, grad_manipulators, grad_final_state)
+        positions, poses, final = self._incoming(trajectory, grad_positions, grad_tools, grad_final_state)
         checkpoints, actions = trajectory.checkpoints
         if not self._engine.made(checkpoints):
             raise InputError("trajectory", came="one made by another simulator", expected="one made by this simulator's rollout")
         gradient = trajectory.initial_state.map(torch.empty_like)
         grad_actions = torch.zeros(actions.shape, dtype=torch.float64)
-        grad_pose = torch.empty(gradient.manipulator_pose.shape, dtype=torch.float64)
+        grad_pose = torch.empty(gradient.tool_pose.shape, dtype=torch.float64)
         last = (None, None, None) if final is None else _arrays(final.velocity, final.affine, final.elastic_strain)
         self._engine.vjp(
             checkpoints,
@@ -148,7 +146,7 @@ class SimulatorNative(SimulatorCheckpointing):
             *last,
             *_arrays(grad_actions, gradient.position, gradient.velocity, gradient.affine, gradient.elastic_strain, grad_pose),
         )
-        start = dataclasses.replace(gradient, manipulator_pose=grad_pose.to(self.dtype))
+        start = dataclasses.replace(gradient, tool_pose=grad_pose.to(self.dtype))
         return RolloutGradient(actions=grad_actions.to(self.dtype), initial_state=start)
 
     def _step_bytes(self) -> int:

@@ -30,7 +30,7 @@ def scene_with_every_tool() -> Scene:
         count = ACTION_COUNTS.get(str(tool["kind"]), 6)
         tools.append({**tool, "position": (0.05 + 0.05 * number, 0.1, 0.2), "action_scale": (0.02,) * count})
     material = {"youngs_modulus": 5.0, "poisson_ratio": 0.3, "yield_stress": 0.1}
-    return Scene.model_validate({"bodies": [body], "manipulators": tools, "material": material, "grid_size": 24, "substeps": 4})
+    return Scene.model_validate({"bodies": [body], "tools": tools, "material": material, "grid_size": 24, "substeps": 4})
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -44,7 +44,7 @@ def test_every_tool_at_the_walls(instruction_set: str, dtype: torch.dtype, memor
     state = simulator.initial_state(batch_size=3)
     actions = torch.linspace(-1.0, 1.0, 3 * 3 * scene.action_size, dtype=dtype).reshape(3, 3, -1)
     trajectory = simulator.rollout(state, actions)
-    gradient = simulator.vjp(trajectory, torch.ones_like(trajectory.positions), torch.ones_like(trajectory.manipulator_poses))
+    gradient = simulator.vjp(trajectory, torch.ones_like(trajectory.positions), torch.ones_like(trajectory.tool_poses))
     assert bool(trajectory.positions.isfinite().all())
     assert bool(gradient.actions.isfinite().all())
     assert float(gradient.actions.abs().max()) > 0.0

@@ -28,7 +28,7 @@ def make_scene(*, particle_count: int = 500, tool_count: int = 1) -> Scene:
     tool = {"kind": "Capsule", "radius": 0.03, "height": 0.05, "position": (0.5, 0.19, 0.5), "action_scale": scale}
     material = {"youngs_modulus": 5.0, "poisson_ratio": 0.3, "yield_stress": 0.1}
     return Scene.model_validate(
-        {"bodies": [body], "manipulators": [tool] * tool_count, "material": material, "grid_size": 32, "substeps": 5}
+        {"bodies": [body], "tools": [tool] * tool_count, "material": material, "grid_size": 32, "substeps": 5}
     )
 
 

@@ -8,25 +8,25 @@ import pytest
 import torch
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.scene import BodyBox, ManipulatorSphere, Scene
-from cpdeform.core.state import manipulator_pose
+from cpdeform.core.scene import BodyBox, Scene, ToolSphere
+from cpdeform.core.state import tool_pose
 from cpdeform.planning.objectives.contact import ContactKind, contact_loss
 
 
 def scene(**options: Any) -> Scene:
     body = BodyBox(position=(0.5, 0.5, 0.5), widths=(0.2, 0.2, 0.2), particle_count=10)
     tools = (
-        ManipulatorSphere(position=(0.5, 0.7, 0.5), radius=0.05, action_scale=(0.01, 0.01, 0.01)),
-        ManipulatorSphere(position=(0.1, 0.1, 0.1), radius=0.05),
-        ManipulatorSphere(position=(0.2, 0.5, 0.5), radius=0.05, action_scale=(0.01, 0.01, 0.01)),
+        ToolSphere(position=(0.5, 0.7, 0.5), radius=0.05, action_scale=(0.01, 0.01, 0.01)),
+        ToolSphere(position=(0.1, 0.1, 0.1), radius=0.05),
+        ToolSphere(position=(0.2, 0.5, 0.5), radius=0.05, action_scale=(0.01, 0.01, 0.01)),
     )
-    return Scene(bodies=(body,), manipulators=tools, **options)
+    return Scene(bodies=(body,), tools=tools, **options)
 
 
 def inputs() -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     positions = 0.4 + 0.2 * torch.rand(2, 3, 10, 3, dtype=torch.float64, generator=generator)
-    poses = manipulator_pose(scene()).expand(2, 3, 3, 8).clone()
+    poses = tool_pose(scene()).expand(2, 3, 3, 8).clone()
     poses[..., :3] += 0.02 * torch.rand(2, 3, 3, 3, dtype=torch.float64, generator=generator)
     return positions, poses
 
@@ -59,7 +59,7 @@ def test_touching_tool_costs_nothing_and_no_tool_neither() -> None:
     positions, poses = inputs()
     poses[..., :3] = positions[..., :1, :]
     assert float(contact_loss(scene(), positions, poses).abs().max()) == 0.0
-    bare = scene().model_copy(update={"manipulators": ()})
+    bare = scene().model_copy(update={"tools": ()})
     assert float(contact_loss(bare, positions, poses[..., :0, :]).abs().max()) == 0.0
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.scene import BodyBox, ManipulatorSphere, Scene
+from cpdeform.core.scene import BodyBox, Scene, ToolSphere
 from cpdeform.core.simulator import Trajectory
 from cpdeform.core.state import initial_state
 from cpdeform.planning.objectives.density import ObjectiveDensity
@@ -16,7 +16,7 @@ from cpdeform.planning.objectives.mass import mass_grid
 SCENE = Scene(
     grid_size=16,
     bodies=(BodyBox(position=(0.4, 0.4, 0.5), widths=(0.2, 0.2, 0.2), particle_count=40),),
-    manipulators=(ManipulatorSphere(position=(0.5, 0.7, 0.5), radius=0.05, action_scale=(0.01, 0.01, 0.01)),),
+    tools=(ToolSphere(position=(0.5, 0.7, 0.5), radius=0.05, action_scale=(0.01, 0.01, 0.01)),),
 )
 START = initial_state(SCENE, batch_size=2, dtype=torch.float64)
 
@@ -24,7 +24,7 @@ START = initial_state(SCENE, batch_size=2, dtype=torch.float64)
 def trajectory(*last: Tensor) -> Trajectory:
     """Two worlds of two steps that end with the given clouds (N, 3)."""
     positions = torch.stack([START.position, START.position, torch.stack(last)], dim=1)
-    poses = START.manipulator_pose.unsqueeze(1).repeat(1, 3, 1, 1)
+    poses = START.tool_pose.unsqueeze(1).repeat(1, 3, 1, 1)
     return Trajectory(positions, poses, torch.zeros(2, 2, 3, dtype=torch.float64), START, START)
 
 
@@ -35,7 +35,7 @@ def test_the_goal_has_none_and_a_shape_elsewhere_all_of_it() -> None:
     assert torch.allclose(result.loss, torch.tensor([0.0, 1.0], dtype=torch.float64), atol=1e-12)
     assert not result.grad_positions[:, :-1].any()
     assert result.grad_positions[1, -1].any()
-    assert result.grad_manipulators is None
+    assert result.grad_tools is None
 
 
 def test_half_of_the_mass_elsewhere_is_a_half() -> None:
@@ -57,7 +57,7 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
 
 
 def test_a_goal_that_does_not_fit_is_named() -> None:
-    with pytest.raises(InputError, match=r"target_grid: got shape \(8, 8, 8\), expected shape \(16, 16, 16\)"):
+    with pytest.raises(InputError, match=r"goal_grid: got shape \(8, 8, 8\), expected shape \(16, 16, 16\)"):
         ObjectiveDensity(SCENE, torch.ones(8, 8, 8))
-    with pytest.raises(InputError, match="target_grid: got no mass"):
+    with pytest.raises(InputError, match="goal_grid: got no mass"):
         ObjectiveDensity(SCENE, torch.zeros(16, 16, 16))

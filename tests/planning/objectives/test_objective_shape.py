@@ -18,7 +18,7 @@ from cpdeform.planning.objectives.transport import ObjectiveTransport
 SCENE = Scene.model_validate(
     {
         "bodies": [{"kind": "box", "position": (0.4, 0.4, 0.4), "widths": (0.2, 0.1, 0.2), "particle_count": 300}],
-        "manipulators": [{"kind": "Sphere", "radius": 0.03, "position": (0.4, 0.7, 0.4), "action_scale": (0.02,) * 3}],
+        "tools": [{"kind": "Sphere", "radius": 0.03, "position": (0.4, 0.7, 0.4), "action_scale": (0.02,) * 3}],
     }
 )
 SHIFT = torch.tensor([0.08, 0.0, 0.0], dtype=torch.float64)
@@ -35,7 +35,7 @@ def start() -> Tensor:
 def path(*clouds: Tensor) -> Trajectory:
     state = initial_state(SCENE, batch_size=len(clouds), dtype=torch.float64)
     positions = torch.stack([torch.stack([start(), cloud]) for cloud in clouds])
-    poses = state.manipulator_pose.unsqueeze(1).repeat(1, 2, 1, 1)
+    poses = state.tool_pose.unsqueeze(1).repeat(1, 2, 1, 1)
     return Trajectory(positions, poses, torch.zeros(len(clouds), 1, 3, dtype=torch.float64), state, state)
 
 

@@ -21,7 +21,7 @@ START = initial_state(SCENE, batch_size=2, dtype=torch.float64)
 def trajectory(*last: Tensor) -> Trajectory:
     """Two worlds of two steps that end with the given clouds (N, 3)."""
     positions = torch.stack([START.position, START.position, torch.stack(last)], dim=1)
-    poses = START.manipulator_pose.unsqueeze(1).repeat(1, 3, 1, 1)
+    poses = START.tool_pose.unsqueeze(1).repeat(1, 3, 1, 1)
     return Trajectory(positions, poses, torch.zeros(2, 2, 0, dtype=torch.float64), START, START)
 
 
@@ -37,9 +37,9 @@ def test_it_is_the_metric_of_a_run_that_started_away_from_the_goal() -> None:
     generator = torch.Generator().manual_seed(0)
     goal, cloud = (START.position[0] + 0.02 * torch.randn(40, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     away = goal + torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64)
-    target = mass_grid(goal, SCENE)
-    loss = ObjectiveSoftIoU(SCENE, target).evaluate(trajectory(cloud, cloud)).loss
-    metric = incremental_iou(mass_grid(cloud, SCENE), mass_grid(away, SCENE), target)
+    goal_grid = mass_grid(goal, SCENE)
+    loss = ObjectiveSoftIoU(SCENE, goal_grid).evaluate(trajectory(cloud, cloud)).loss
+    metric = incremental_iou(mass_grid(cloud, SCENE), mass_grid(away, SCENE), goal_grid)
     assert 0.1 < float(metric) < 0.99
     assert float(loss[0]) == pytest.approx(1.0 - float(metric))
 
@@ -55,7 +55,7 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
 
 
 def test_a_goal_that_does_not_fit_is_named() -> None:
-    with pytest.raises(InputError, match=r"target_grid: got shape \(8, 8, 8\), expected shape \(16, 16, 16\)"):
+    with pytest.raises(InputError, match=r"goal_grid: got shape \(8, 8, 8\), expected shape \(16, 16, 16\)"):
         ObjectiveSoftIoU(SCENE, torch.ones(8, 8, 8))
-    with pytest.raises(InputError, match="target_grid: got no mass"):
+    with pytest.raises(InputError, match="goal_grid: got no mass"):
         ObjectiveSoftIoU(SCENE, torch.zeros(16, 16, 16))

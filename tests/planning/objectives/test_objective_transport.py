@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.ot import OTCapabilities, OTResult, OTSolver
-from cpdeform.core.scene import BodyBox, ManipulatorSphere, Scene
+from cpdeform.core.scene import BodyBox, Scene, ToolSphere
 from cpdeform.core.simulator import Trajectory
 from cpdeform.core.state import initial_state
 from cpdeform.planning.objectives.contact import contact_loss
@@ -19,7 +19,7 @@ from cpdeform.planning.objectives.transport import ObjectiveTransport
 
 SCENE = Scene(
     bodies=(BodyBox(position=(0.5, 0.4, 0.5), widths=(0.3, 0.3, 0.3), particle_count=12),),
-    manipulators=(ManipulatorSphere(position=(0.5, 0.7, 0.5), radius=0.05, action_scale=(0.01, 0.01, 0.01)),),
+    tools=(ToolSphere(position=(0.5, 0.7, 0.5), radius=0.05, action_scale=(0.01, 0.01, 0.01)),),
 )
 
 
@@ -55,54 +55,54 @@ def trajectory(worlds: int = 2) -> Trajectory:
     state = initial_state(SCENE, batch_size=worlds, dtype=torch.float64)
     noise = torch.randn(worlds, 4, 12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     positions = state.position.unsqueeze(1) + 0.02 * noise
-    poses = state.manipulator_pose.unsqueeze(1).repeat(1, 4, 1, 1)
+    poses = state.tool_pose.unsqueeze(1).repeat(1, 4, 1, 1)
     return Trajectory(positions, poses, torch.zeros(worlds, 3, 3, dtype=torch.float64), state, state)
 
 
-def goal(count: int = 12) -> Tensor:
+def make_goal(count: int = 12) -> Tensor:
     return torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
 
 
 def test_value_and_gradient_of_the_last_step() -> None:
     path = trajectory()
-    result = ObjectiveTransport(OTSolverMean(), goal()).evaluate(path)
+    result = ObjectiveTransport(OTSolverMean(), make_goal()).evaluate(path)
     positions = path.positions.clone().requires_grad_()
-    expected = 0.5 * ((positions[:, -1].mean(dim=1) - goal().mean(dim=0)) ** 2).sum(dim=1)
+    expected = 0.5 * ((positions[:, -1].mean(dim=1) - make_goal().mean(dim=0)) ** 2).sum(dim=1)
     (gradient,) = torch.autograd.grad(expected.sum(), positions)
     assert torch.allclose(result.loss, expected.detach())
     assert torch.allclose(result.grad_positions, gradient)
-    assert result.grad_manipulators is None
+    assert result.grad_tools is None
 
 
 def test_contact_term_is_added_over_the_steps() -> None:
     path, solver = trajectory(), OTSolverMean()
-    plain = ObjectiveTransport(solver, goal()).evaluate(path)
-    result = ObjectiveTransport(solver, goal(), contact_weight=3.0, scene=SCENE).evaluate(path)
-    positions, poses = path.positions.clone().requires_grad_(), path.manipulator_poses.clone().requires_grad_()
+    plain = ObjectiveTransport(solver, make_goal()).evaluate(path)
+    result = ObjectiveTransport(solver, make_goal(), contact_weight=3.0, scene=SCENE).evaluate(path)
+    positions, poses = path.positions.clone().requires_grad_(), path.tool_poses.clone().requires_grad_()
     contact = 3.0 * contact_loss(SCENE, positions[:, 1:], poses[:, 1:]).sum(dim=1)
     gradients = torch.autograd.grad(contact.sum(), [positions, poses])
     assert torch.allclose(result.loss, plain.loss + contact.detach())
     assert torch.allclose(result.grad_positions, plain.grad_positions + gradients[0])
-    assert result.grad_manipulators is not None
-    assert torch.allclose(result.grad_manipulators, gradients[1])
+    assert result.grad_tools is not None
+    assert torch.allclose(result.grad_tools, gradients[1])
     assert not path.positions.requires_grad
 
 
 def test_contact_term_of_a_scene_without_tools_is_zero() -> None:
-    bare = SCENE.model_copy(update={"manipulators": ()})
+    bare = SCENE.model_copy(update={"tools": ()})
     path = trajectory()
-    result = ObjectiveTransport(OTSolverMean(), goal(), contact_weight=3.0, scene=bare).evaluate(path)
-    assert torch.equal(result.loss, ObjectiveTransport(OTSolverMean(), goal()).evaluate(path).loss)
+    result = ObjectiveTransport(OTSolverMean(), make_goal(), contact_weight=3.0, scene=bare).evaluate(path)
+    assert torch.equal(result.loss, ObjectiveTransport(OTSolverMean(), make_goal()).evaluate(path).loss)
 
 
 def test_subset_is_fixed_shared_and_reproducible() -> None:
     path, solver = trajectory(worlds=1), OTSolverMean()
-    target = path.positions[0, -1].clone()
-    objective = ObjectiveTransport(solver, target, points=5, seed=3)
+    goal = path.positions[0, -1].clone()
+    objective = ObjectiveTransport(solver, goal, points=5, seed=3)
     result = objective.evaluate(path)
     objective.evaluate(path)
-    ObjectiveTransport(solver, target, points=5, seed=3).evaluate(path)
-    ObjectiveTransport(solver, target, points=5, seed=4).evaluate(path)
+    ObjectiveTransport(solver, goal, points=5, seed=3).evaluate(path)
+    ObjectiveTransport(solver, goal, points=5, seed=4).evaluate(path)
     sources = [source for source, _, _ in solver.calls]
     assert sources[0].shape == (5, 3)
     assert all(torch.equal(source, cloud) for source, cloud, _ in solver.calls)
@@ -110,19 +110,19 @@ def test_subset_is_fixed_shared_and_reproducible() -> None:
     assert torch.equal(sources[0], sources[2])
     assert not torch.equal(sources[0], sources[3])
     assert float(result.loss[0]) == 0.0
-    moved = ObjectiveTransport(solver, target + 0.1, points=5, seed=3).evaluate(path)
+    moved = ObjectiveTransport(solver, goal + 0.1, points=5, seed=3).evaluate(path)
     assert int((moved.grad_positions[0, -1].norm(dim=-1) > 0).sum()) == 5
 
 
 def test_clouds_of_different_size_have_their_own_subsets() -> None:
     solver = OTSolverMean()
-    ObjectiveTransport(solver, goal(30), points=20).evaluate(trajectory(worlds=1))
+    ObjectiveTransport(solver, make_goal(30), points=20).evaluate(trajectory(worlds=1))
     assert [tuple(cloud.shape) for cloud in solver.calls[0][:2]] == [(12, 3), (20, 3)]
 
 
 def test_warm_starts_refresh_and_reset() -> None:
     path, solver = trajectory(worlds=1), OTSolverMean()
-    objective = ObjectiveTransport(solver, goal(), refresh=3)
+    objective = ObjectiveTransport(solver, make_goal(), refresh=3)
     # The chain is the caller's: it hands each result's `warm` to the next call.
     warm = objective.evaluate(path).warm
     moved = dataclasses.replace(path, positions=path.positions + 1e-3)
@@ -134,7 +134,7 @@ def test_warm_starts_refresh_and_reset() -> None:
 
 def test_every_batch_starts_from_the_solution_of_the_stages_start() -> None:
     solver = OTSolverMean()
-    objective = ObjectiveTransport(solver, goal(), refresh=2)
+    objective = ObjectiveTransport(solver, make_goal(), refresh=2)
     start = objective.evaluate(trajectory(worlds=1))
     assert start.warm is not None
     for _ in range(2):
@@ -153,14 +153,14 @@ def test_every_batch_starts_from_the_solution_of_the_stages_start() -> None:
 def test_a_start_that_is_known_is_not_solved_again() -> None:
     """A stage begins with the particles that the one before ended with."""
     solver, path = OTSolverMean(), trajectory(worlds=1)
-    objective = ObjectiveTransport(solver, goal(), coast_steps=2.0)
+    objective = ObjectiveTransport(solver, make_goal(), coast_steps=2.0)
     first = objective.evaluate(path)
     objective.evaluate(trajectory())
     still = dataclasses.replace(path, positions=path.positions[:, -1:].repeat(1, 4, 1, 1))
     again = objective.evaluate(still, first.warm)
     assert len(solver.calls) == 3
     # Only the term for particles that still move differs.
-    cost = ObjectiveTransport(OTSolverMean(), goal()).evaluate(still)
+    cost = ObjectiveTransport(OTSolverMean(), make_goal()).evaluate(still)
     torch.testing.assert_close(again.loss, cost.loss)
     torch.testing.assert_close(again.grad_positions[:, -1], cost.grad_positions[:, -1])
     assert float(first.loss[0]) > float(again.loss[0])
@@ -171,7 +171,7 @@ def test_a_start_that_is_known_is_not_solved_again() -> None:
 
 def test_every_world_starts_from_its_own_solution() -> None:
     solver = OTSolverMean()
-    objective = ObjectiveTransport(solver, goal())
+    objective = ObjectiveTransport(solver, make_goal())
     first = objective.evaluate(trajectory())
     moved = trajectory()
     objective.evaluate(dataclasses.replace(moved, positions=moved.positions + 1e-3), first.warm)
@@ -182,7 +182,7 @@ def test_every_world_starts_from_its_own_solution() -> None:
 
 def test_without_warm_starts() -> None:
     solver = OTSolverMean()
-    objective = ObjectiveTransport(solver, goal(), warm_start=False)
+    objective = ObjectiveTransport(solver, make_goal(), warm_start=False)
     objective.evaluate(trajectory())
     objective.evaluate(trajectory())
     assert not any(solver.warm)
@@ -191,14 +191,14 @@ def test_without_warm_starts() -> None:
 def test_options_are_checked() -> None:
     solver = OTSolverMean()
     with pytest.raises(InputError, match="points: got 0"):
-        ObjectiveTransport(solver, goal(), points=0)
+        ObjectiveTransport(solver, make_goal(), points=0)
     with pytest.raises(InputError, match="refresh: got 0"):
-        ObjectiveTransport(solver, goal(), refresh=0)
+        ObjectiveTransport(solver, make_goal(), refresh=0)
     with pytest.raises(InputError, match="contact_weight: got nan"):
-        ObjectiveTransport(solver, goal(), contact_weight=float("nan"), scene=SCENE)
+        ObjectiveTransport(solver, make_goal(), contact_weight=float("nan"), scene=SCENE)
     with pytest.raises(InputError, match="scene: got None"):
-        ObjectiveTransport(solver, goal(), contact_weight=1.0)
-    with pytest.raises(InputError, match="target: got shape"):
+        ObjectiveTransport(solver, make_goal(), contact_weight=1.0)
+    with pytest.raises(InputError, match="goal: got shape"):
         ObjectiveTransport(solver, torch.zeros(0, 3))
 
 
@@ -209,22 +209,22 @@ def exact_distance(source: Tensor, target: Tensor) -> float:
 
 
 def test_coasting_bounds_the_distance_later_and_has_the_right_gradient() -> None:
-    path, target, steps = trajectory(), goal(), 5.0
+    path, goal, steps = trajectory(), make_goal(), 5.0
     positions = path.positions.clone()
     generator = torch.Generator().manual_seed(3)
     positions[:, -1] = positions[:, -2] + 0.01 * torch.randn(positions[:, -1].shape, generator=generator, dtype=torch.float64)
 
     def coast(moved: Tensor) -> tuple[Tensor, Tensor]:
         moved_path = dataclasses.replace(path, positions=moved)
-        plain = ObjectiveTransport(OTSolverMean(), target).evaluate(moved_path)
-        coasting = ObjectiveTransport(OTSolverMean(), target, coast_steps=steps).evaluate(moved_path)
+        plain = ObjectiveTransport(OTSolverMean(), goal).evaluate(moved_path)
+        coasting = ObjectiveTransport(OTSolverMean(), goal, coast_steps=steps).evaluate(moved_path)
         return coasting.loss - plain.loss, coasting.grad_positions - plain.grad_positions
 
     distance, slope = coast(positions)
     step = positions[:, -1] - positions[:, -2]
     assert torch.allclose(distance, steps * step.norm(dim=-1).mean(dim=-1), rtol=1e-2)
     for now, further, added in zip(positions[:, -1], step, distance, strict=True):
-        assert exact_distance(now + steps * further, target) <= exact_distance(now, target) + float(added) + 1e-4
+        assert exact_distance(now + steps * further, goal) <= exact_distance(now, goal) + float(added) + 1e-4
     direction = torch.randn(positions.shape, generator=generator, dtype=torch.float64)
     numerical = (coast(positions + 1e-6 * direction)[0] - coast(positions - 1e-6 * direction)[0]) / 2e-6
     assert torch.allclose((slope * direction).sum(dim=(1, 2, 3)), numerical, rtol=1e-5)
@@ -234,14 +234,14 @@ def test_coasting_bounds_the_distance_later_and_has_the_right_gradient() -> None
 
 
 def test_axis_scale_counts_one_coordinate_more_and_has_the_right_gradient() -> None:
-    path, target = trajectory(), goal()
+    path, goal = trajectory(), make_goal()
 
     def transport(positions: Tensor, scale: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
-        objective = ObjectiveTransport(OTSolverMean(), target, axis_scale=scale)
+        objective = ObjectiveTransport(OTSolverMean(), goal, axis_scale=scale)
         result = objective.evaluate(dataclasses.replace(path, positions=positions))
         return result.loss, result.grad_positions
 
-    offset = path.positions[:, -1].mean(dim=1) - target.mean(dim=0)
+    offset = path.positions[:, -1].mean(dim=1) - goal.mean(dim=0)
     factors = torch.tensor([1.0, 4.0, 0.5], dtype=torch.float64)
     loss, gradient = transport(path.positions, (1.0, 4.0, 0.5))
     assert torch.allclose(loss, 0.5 * (factors * offset).square().sum(dim=1))
@@ -249,4 +249,4 @@ def test_axis_scale_counts_one_coordinate_more_and_has_the_right_gradient() -> N
     ahead, back = (transport(path.positions + sign * 1e-6 * direction, (1.0, 4.0, 0.5))[0] for sign in (1, -1))
     assert torch.allclose((gradient * direction).sum(dim=(1, 2, 3)), (ahead - back) / 2e-6, rtol=1e-6)
     with pytest.raises(InputError, match=r"axis_scale: got \(1.0, 0.0, 1.0\)"):
-        ObjectiveTransport(OTSolverMean(), target, axis_scale=(1.0, 0.0, 1.0))
+        ObjectiveTransport(OTSolverMean(), goal, axis_scale=(1.0, 0.0, 1.0))

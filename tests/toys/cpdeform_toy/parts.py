@@ -41,7 +41,7 @@ class PlacerToy(Placer):
         rounds: How often to ask again.
     """
 
-    capabilities = PlacerCapabilities(needs_priorities=True, max_manipulators=1)
+    capabilities = PlacerCapabilities(needs_priorities=True, max_tools=1)
 
     def __init__(self, *, count: int = 3, spacing: float = 0.1, rounds: int = 1) -> None:
         self.count, self.spacing, self.rounds = count, spacing, rounds
@@ -52,7 +52,7 @@ class PlacerToy(Placer):
         particle = int(stage.priorities.argmax())
         placements = []
         for index in range(self.count):
-            pose = stage.state.manipulator_pose[0].clone()
+            pose = stage.state.tool_pose[0].clone()
             pose[0, 0] += self.spacing * (index + 1)
             placements.append(Proposal(pose, float(stage.priorities.max()), f"candidate-{index}", particle))
         return placements
@@ -65,7 +65,7 @@ class PlacerToy(Placer):
 class PlacerFixedToy(PlacerToy):
     """Leaves the tools where they are and needs no priorities."""
 
-    capabilities = PlacerCapabilities(needs_priorities=False, max_manipulators=None)
+    capabilities = PlacerCapabilities(needs_priorities=False, max_tools=None)
 
     def ask(self, stage) -> list[Proposal]:
-        return [Proposal(stage.state.manipulator_pose[0], float("nan"), "fixed")]
+        return [Proposal(stage.state.tool_pose[0], float("nan"), "fixed")]

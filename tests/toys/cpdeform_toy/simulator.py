@@ -24,7 +24,7 @@ class SimulatorToy(Simulator):
         differentiable=True,
         devices=("cpu",),
         dtypes=(torch.float64, torch.float32),
-        manipulator_kinds=("Sphere", "Capsule", "Box", "Cylinder", "Torus"),
+        tool_kinds=("Sphere", "Capsule", "Box", "Cylinder", "Torus"),
         deterministic_devices=("cpu",),
     )
 
@@ -35,7 +35,7 @@ class SimulatorToy(Simulator):
         self.largest_batch = 0
 
     def gain(self, state: State) -> Tensor:
-        distance = state.manipulator_pose[:, 0, 0] - state.position[:, :, 0].mean(dim=1)
+        distance = state.tool_pose[:, 0, 0] - state.position[:, :, 0].mean(dim=1)
         return torch.exp(-4.0 * distance**2)
 
     def rollout(self, state: State, actions: Tensor) -> Trajectory:
@@ -47,15 +47,15 @@ class SimulatorToy(Simulator):
         positions = state.position[:, None] + body[:, :, None]
         broken = (actions > self.break_above).flatten(1).any(dim=1)
         positions = torch.where(broken[:, None, None, None], torch.nan, positions)
-        poses = state.manipulator_pose[:, None].repeat(1, actions.shape[1] + 1, 1, 1)
+        poses = state.tool_pose[:, None].repeat(1, actions.shape[1] + 1, 1, 1)
         poses[..., :3] += shift[:, :, None]
-        final = dataclasses.replace(state, position=positions[:, -1], manipulator_pose=poses[:, -1])
+        final = dataclasses.replace(state, position=positions[:, -1], tool_pose=poses[:, -1])
         return Trajectory(positions, poses, actions, state, final)
 
-    def vjp(self, trajectory, grad_positions, grad_manipulators=None) -> RolloutGradient:
+    def vjp(self, trajectory, grad_positions, grad_tools=None) -> RolloutGradient:
         grad_shift = self.gain(trajectory.initial_state)[:, None, None] * grad_positions.sum(dim=2)
-        if grad_manipulators is not None:
-            grad_shift = grad_shift + grad_manipulators[..., :3].sum(dim=2)
+        if grad_tools is not None:
+            grad_shift = grad_shift + grad_tools[..., :3].sum(dim=2)
         later = grad_shift[:, 1:].flip(1).cumsum(1).flip(1)
         actions = torch.zeros_like(trajectory.actions)
         actions[..., :3] = later * self.scale(actions)
@@ -65,7 +65,7 @@ class SimulatorToy(Simulator):
         return 8 * (worlds or self.batch_size) * step_count * self.scene.particle_count * 3
 
     def scale(self, actions: Tensor) -> Tensor:
-        return torch.tensor(self.scene.manipulators[0].action_scale[:3]).to(actions)
+        return torch.tensor(self.scene.tools[0].action_scale[:3]).to(actions)
 
     @staticmethod
     def _pad(shift: Tensor) -> Tensor:

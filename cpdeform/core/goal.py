@@ -1,4 +1,4 @@
-"""Goal files: particles of a target shape, with its node masses where it was imported from a grid."""
+"""Goal files: particles of the shape wanted, with its node masses where it was imported from a grid."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from cpdeform.core.reading.arrays import check_bytes, open_arrays
 from cpdeform.core.reading.limits import ReadingLimits
 from cpdeform.core.scene import Scene
 
-_EXPECTED = "an .npz, .npy or .h5 file of target particles"
+_EXPECTED = "an .npz, .npy or .h5 file of goal particles"
 
 POSITION_SCALE = 2**16
 """Integer positions in a file are whole multiples of 1/POSITION_SCALE, length units."""
 
 
-def load_target(path: Path, *, scene: Scene, limits: ReadingLimits | None = None) -> NDArray[np.float64]:
-    """Read target particles from ``.npz`` or ``.h5`` with an array ``position`` (M, 3), or from ``.npy`` with such an array.
+def load_goal(path: Path, *, scene: Scene, limits: ReadingLimits | None = None) -> NDArray[np.float64]:
+    """Read goal particles from ``.npz`` or ``.h5`` with an array ``position`` (M, 3), or from ``.npy`` with such an array.
 
     Integer arrays are positions in units of 2^-16 (compact files), others are in length units.
 
     Args:
         path: The file.
-        scene: Its domain must hold the target.
+        scene: Its domain must hold the goal.
         limits: How large it may be; defaults to `cpdeform.core.reading.limits.default_limits`.
 
     Returns:
@@ -37,7 +37,7 @@ def load_target(path: Path, *, scene: Scene, limits: ReadingLimits | None = None
     Raises:
         InputError: The file is missing, unreadable or too large, or holds something else than finite positions in the domain.
     """
-    argument = f"target file {path}"
+    argument = f"goal file {path}"
     with open_arrays(path, argument=argument, expected=_EXPECTED, limits=limits) as file:
         if "position" not in file:
             raise InputError(argument, came="no array of that name", expected='an array "position" of shape (M, 3)')
@@ -57,18 +57,18 @@ def load_target(path: Path, *, scene: Scene, limits: ReadingLimits | None = None
             argument,
             came=f"{outside} of {len(positions)} particles outside the domain",
             expected=f"positions within {lower} and {upper}",
-            remedy="Scale or shift the target.",
+            remedy="Scale or shift the goal.",
         )
     return positions
 
 
-def load_target_grid(path: Path, *, scene: Scene, limits: ReadingLimits | None = None) -> NDArray[np.float64] | None:
+def load_goal_grid(path: Path, *, scene: Scene, limits: ReadingLimits | None = None) -> NDArray[np.float64] | None:
     """Read the node masses of a goal file: arrays ``grid_cells`` (K, 3), node indices, and ``grid_mass`` (K,).
 
     Args:
         path: The file.
         scene: Its grid is the one that the masses belong to.
-        limits: As for `load_target`.
+        limits: As for `load_goal`.
 
     Returns:
         Node masses (G, G, G); None where the file holds none.
@@ -76,7 +76,7 @@ def load_target_grid(path: Path, *, scene: Scene, limits: ReadingLimits | None =
     Raises:
         InputError: The file is missing, unreadable or too large, or the masses do not fit the scene's grid.
     """
-    argument = f"target file {path}"
+    argument = f"goal file {path}"
     with open_arrays(path, argument=argument, expected=_EXPECTED, limits=limits) as file:
         if not file.names or "grid_cells" not in file or "grid_mass" not in file:
             return None
@@ -125,11 +125,11 @@ def load_correspondence(path: Path) -> bool:
     Raises:
         InputError: The file is missing or unreadable, or the array is no single truth value.
     """
-    with open_arrays(path, argument=f"target file {path}", expected=_EXPECTED) as file:
+    with open_arrays(path, argument=f"goal file {path}", expected=_EXPECTED) as file:
         return bool(file.names) and "corresponds" in file and bool(file.read("corresponds", shape=(), kinds="b"))
 
 
-def write_target(
+def write_goal(
     path: Path, position: NDArray[Any], *, grid: NDArray[np.floating[Any]] | None = None, corresponds: bool = False
 ) -> None:
     """Write a goal file, an ``.npz`` whose bytes depend on its content alone (no time stamp).

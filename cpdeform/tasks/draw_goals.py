@@ -1,4 +1,4 @@
-"""Draw start and target of tasks onto contact sheets: `python -m cpdeform.tasks.draw_targets [--out docs/pictures]`."""
+"""Draw start and goal of tasks onto contact sheets: `python -m cpdeform.tasks.draw_goals [--out docs/pictures]`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cpdeform.core.plugins import Registry, load_registry
 from cpdeform.core.sampling import sample_particles
-from cpdeform.core.state import manipulator_pose
+from cpdeform.core.state import tool_pose
 from cpdeform.core.task import Task, list_variants, load_task, task_path
 from cpdeform.report.pictures import View, clay_colours, draw_scene
 from cpdeform.report.render import fit_camera
@@ -34,14 +34,14 @@ PANEL_WIDTHS = {True: 2.2, False: 3.6}
 
 SHEETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
-        "targets-multi-stage-1": ("airplane", "chair", "bottle", "star"),
-        "targets-multi-stage-2": ("move++", "rope++", "writer++", "pinch"),
-        "targets-single-stage-1": ("move", "triple-move", "torus"),
-        "targets-single-stage-2": ("rope", "rolling-pin", "writer"),
-        "targets-single-stage-3": ("chopsticks", "assembly", "table"),
+        "goals-multi-stage-1": ("airplane", "chair", "bottle", "star"),
+        "goals-multi-stage-2": ("move++", "rope++", "writer++", "pinch"),
+        "goals-single-stage-1": ("move", "triple-move", "torus"),
+        "goals-single-stage-2": ("rope", "rolling-pin", "writer"),
+        "goals-single-stage-3": ("chopsticks", "assembly", "table"),
     }
 )
-"""The tasks on each contact sheet. A task with variants fills two rows, starts and targets; another one two panels."""
+"""The tasks on each contact sheet. A task with variants fills two rows, starts and goals; another one two panels."""
 
 
 def main(
@@ -88,22 +88,22 @@ def draw_sheet(names: tuple[str, ...], path: Path, *, registry: Registry) -> Pat
 
 
 def _draw_pair(upper: Any, lower: Any, task: Task, *, width: int) -> None:
-    """Draw a task's start with its tools above, its target below, each `width` pixels wide."""
-    start, target = sample_particles(task.scene), task.load_target()
-    pose = manipulator_pose(task.scene).numpy()
-    tools = [tool_surface(tool, pose[index], rows=220, columns=320) for index, tool in enumerate(task.scene.manipulators)]
+    """Draw a task's start with its tools above, its goal below, each `width` pixels wide."""
+    start, goal = sample_particles(task.scene), task.load_goal()
+    pose = tool_pose(task.scene).numpy()
+    tools = [tool_surface(tool, pose[index], rows=220, columns=320) for index, tool in enumerate(task.scene.tools)]
     # A fixed pillar may reach far below the floor; that part is not worth the room.
     tools = [np.maximum(surface, (-np.inf, task.scene.ground_height, -np.inf)) for surface in tools]
-    view = _make_view(task, start, target, tools)
+    view = _make_view(task, start, goal, tools)
     draw_scene(upper, view, start, clay_colours(view, start), tools, width=width)
     upper.set_title(f"{task.name}: start", fontsize=7, pad=1.5)
-    view = dataclasses.replace(view, radius=_particle_radius(target))
-    draw_scene(lower, view, target, clay_colours(view, target), [], width=width)
-    lower.set_title("target", fontsize=7, pad=1.5)
+    view = dataclasses.replace(view, radius=_particle_radius(goal))
+    draw_scene(lower, view, goal, clay_colours(view, goal), [], width=width)
+    lower.set_title("goal", fontsize=7, pad=1.5)
 
 
-def _make_view(task: Task, start: Array, target: Array, tools: list[Array]) -> View:
-    clay = np.concatenate([start, target])
+def _make_view(task: Task, start: Array, goal: Array, tools: list[Array]) -> View:
+    clay = np.concatenate([start, goal])
     low, high = clay.min(axis=0), clay.max(axis=0)
     ground = task.scene.ground_height
     x, z = (low[0] - 0.03, high[0] + 0.03), (low[2] - 0.03, high[2] + 0.03)

@@ -1,4 +1,4 @@
-"""Make or verify the target files: `python -m cpdeform.tasks.make_targets [TASKS...] [--check]`."""
+"""Make or verify the goal files: `python -m cpdeform.tasks.make_goals [TASKS...] [--check]`."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import typer
 from numpy.typing import NDArray
 
 from cpdeform.core.errors import UnknownNameError
+from cpdeform.core.goal import POSITION_SCALE, load_goal, write_goal
 from cpdeform.core.plugins import AUTO, Registry, load_registry
 from cpdeform.core.simulator import Simulator
-from cpdeform.core.target import POSITION_SCALE, load_target, write_target
 from cpdeform.core.task import Task, load_task
 from cpdeform.tasks.multi_stage import MULTI_STAGE, Maker
 from cpdeform.tasks.single_stage import SINGLE_STAGE
@@ -38,7 +38,7 @@ def chosen(names: list[str]) -> list[str]:
     for name in names:
         found = [key for key in MAKERS if name in (key, key.rpartition("-")[0])]
         if not found:
-            raise UnknownNameError("target of task", name, MAKERS)
+            raise UnknownNameError("goal of task", name, MAKERS)
         result += found
     return result or list(MAKERS)
 
@@ -60,8 +60,8 @@ def make(task: Task, *, backend: str, registry: Registry) -> NDArray[np.float64]
 
 
 def agreement(task: Task, position: NDArray[np.float64]) -> float:
-    """Share of the coordinates at which the task's target file agrees with these positions (N, 3)."""
-    stored = load_target(task.target, scene=task.scene)
+    """Share of the coordinates at which the task's goal file agrees with these positions (N, 3)."""
+    stored = load_goal(task.goal, scene=task.scene)
     if stored.shape != position.shape:
         return 0.0
     rounded = np.rint(position * POSITION_SCALE) / POSITION_SCALE
@@ -73,7 +73,7 @@ def main(
     check: Annotated[bool, typer.Option("--check", help="Compare with the files that are there instead of writing.")] = False,
     backend: Annotated[str, typer.Option(help="Simulator to make them with; must compute in float64.")] = AUTO,
 ) -> None:
-    """Make the targets of tasks and write them, or compare them with the files that are there."""
+    """Make the goals of tasks and write them, or compare them with the files that are there."""
     registry = load_registry()
     backend = registry.resolve("simulator", backend, device="cpu")
     different = 0
@@ -87,10 +87,10 @@ def main(
             verdict = "agrees" if share >= SHARE else "DIFFERENT"
             text = f"{verdict}, {100.0 * share:.2f}% of the coordinates"
         else:
-            task.target.parent.mkdir(parents=True, exist_ok=True)
-            write_target(task.target, position, corresponds=MAKERS[task.name][1])
-            text = f"{len(position)} particles, {task.target.stat().st_size} bytes"
-        typer.echo(f"{task.target.name}: {text}, {time.perf_counter() - start:.1f} s")
+            task.goal.parent.mkdir(parents=True, exist_ok=True)
+            write_goal(task.goal, position, corresponds=MAKERS[task.name][1])
+            text = f"{len(position)} particles, {task.goal.stat().st_size} bytes"
+        typer.echo(f"{task.goal.name}: {text}, {time.perf_counter() - start:.1f} s")
     raise typer.Exit(1 if different else 0)
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-class ManipulatorBase(FrozenModel, abc.ABC):
+class ToolBase(FrozenModel, abc.ABC):
     """A rigid tool, moved by actions or fixed.
 
     Attributes:
@@ -42,7 +42,7 @@ class ManipulatorBase(FrozenModel, abc.ABC):
     """What the possible numbers of action components stand for."""
 
     @model_validator(mode="after")
-    def _check(self) -> ManipulatorBase:
+    def _check(self) -> ToolBase:
         if len(self.action_scale) not in self.action_meanings:
             expected = " or ".join(f"{count} ({meaning})" for count, meaning in self.action_meanings.items())
             raise InputError("action_scale", came=f"{len(self.action_scale)} components", expected=expected)
@@ -87,12 +87,12 @@ class ManipulatorBase(FrozenModel, abc.ABC):
         return any(scale > 0.0 for scale in self.action_scale)
 
 
-def shape_of(manipulator: ManipulatorBase, *, gap: Tensor | float | None = None) -> Shape:
-    """The solid that a tool is; see `ManipulatorBase.shape`.
+def shape_of(tool: ToolBase, *, gap: Tensor | float | None = None) -> Shape:
+    """The solid that a tool is; see `ToolBase.shape`.
 
     Raises:
         InputError: It is no tool.
     """
-    if not isinstance(manipulator, ManipulatorBase):
-        raise InputError("manipulator", came=type(manipulator).__name__, expected="a manipulator of cpdeform.core.scene")
-    return manipulator.shape(gap=gap)
+    if not isinstance(tool, ToolBase):
+        raise InputError("tool", came=type(tool).__name__, expected="a tool of cpdeform.core.scene")
+    return tool.shape(gap=gap)
