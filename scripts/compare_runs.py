@@ -28,6 +28,9 @@ RUNS = {
     "pinch": ("pinch", "--stages", "1", "--iterations", "4"),
 }
 NATIVE = "plugins/cpdeform-native"
+OLD_NAMES = {"tool_poses": "manipulator_poses", "state/tool_pose": "state/manipulator_pose"}
+"""What arrays were called up to format 2 of the record."""
+
 DATASETS = ("actions", "positions", "tool_poses", "placements/actions", "placements/loss", "placements/pose")
 STATE = ("position", "velocity", "affine", "elastic_strain", "tool_pose")
 WITHOUT_EDITABLE = (
@@ -92,7 +95,7 @@ def arrays(record: Path) -> dict[str, np.ndarray]:
     for path in sorted(record.glob("stage-*.h5")):
         with h5py.File(path, "r") as file:
             for name in (*DATASETS, *(f"state/{field}" for field in STATE)):
-                found[f"{path.name}/{name}"] = file[name][()]
+                found[f"{path.name}/{name}"] = file[name if name in file else OLD_NAMES[name]][()]
     return found
 
 
