@@ -77,10 +77,12 @@ class TransportProblem:
         exponent: Power p of the distance in the cost |x - y|^p: 1 for potentials as priorities (the paper), 2 for displacements.
         blur: Entropic blur, length units. The larger, the quicker and the smoother; up to half a centimetre the potentials' peak
             stays at the particles that have to move, displacements allow for two.
+        tolerance: Error of the marginals that is good enough, for solvers that have the option; None leaves it to them.
     """
 
     exponent: int = 1
     blur: float = 5e-3
+    tolerance: float | None = None
 
 
 LEAST_RELATIVE_BLUR = 1e-6

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 
@@ -55,12 +57,13 @@ def make_priorities_solver(problem: TransportProblem | None, configuration: RunC
         InputError: The solver cannot solve for that cost.
     """
     asked = problem or TransportProblem()
+    wished = {} if asked.tolerance is None else {"tolerance": asked.tolerance}
     options = {"blur": asked.blur, **configuration.ot_options}
     if asked.exponent != 1:
         options["exponent"] = asked.exponent
     name = configuration.ot
     try:
-        solver: OTSolver = registry.create("ot_solver", name, **options)
+        return _solver_with(name, wished, options, registry=registry)
     except UnknownNameError as error:
         if asked.exponent == 1 or error.name != "exponent":
             raise
@@ -70,6 +73,17 @@ def make_priorities_solver(problem: TransportProblem | None, configuration: RunC
             expected=f'"potential", since the transport solver {name} has no option exponent',
             remedy="Set it with --set priorities.kind=potential, or choose another solver with --ot.",
         ) from error
+
+
+def _solver_with(name: str, wished: Mapping[str, Any], options: Mapping[str, Any], *, registry: Registry) -> OTSolver:
+    """A solver with the options that it has to have, and those that are only wished for if it knows them."""
+    solver: OTSolver
+    try:
+        solver = registry.create("ot_solver", name, **{**wished, **options})
+    except UnknownNameError as error:
+        if error.name not in wished or error.name in options:
+            raise
+        solver = registry.create("ot_solver", name, **options)
     return solver
 
 

@@ -57,9 +57,11 @@ def _stencil(points: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
     offset = (scaled - base).unsqueeze(-1)
     weights = torch.cat([0.5 * (1.5 - offset) ** 2, 0.75 - (offset - 1.0) ** 2, 0.5 * (offset - 0.5) ** 2], dim=-1)
     slopes = torch.cat([offset - 1.5, 2.0 - 2.0 * offset, offset - 0.5], dim=-1)
-    axes = base.long().unsqueeze(-1) + torch.arange(3, device=points.device)
-    nodes = (axes[:, 0, :, None, None] * size + axes[:, 1, None, :, None]) * size + axes[:, 2, None, None, :]
-    return nodes.reshape(-1, STENCIL), weights, slopes
+    corner = base.long()
+    first = (corner[:, 0] * size + corner[:, 1]) * size + corner[:, 2]
+    axis = torch.arange(3, device=points.device)
+    offsets = (axis[:, None, None] * size + axis[:, None]) * size + axis
+    return first[:, None] + offsets.reshape(-1), weights, slopes
 
 
 def _products(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
@@ -84,7 +86,7 @@ class _MassGrid(torch.autograd.Function):
         counts = frames.new_zeros(frames.shape[0], size**3)
         for frame, part in _chunks(frames):
             nodes, weights, _ = _stencil(frames[frame, part], size)
-            counts[frame].index_add_(0, nodes.reshape(-1), _products(*weights.unbind(1)).reshape(-1))
+            counts[frame].scatter_add_(0, nodes.reshape(-1), _products(*weights.unbind(1)).reshape(-1))
         return counts
 
     @staticmethod

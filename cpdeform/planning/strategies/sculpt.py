@@ -13,6 +13,7 @@ from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
 from cpdeform.planning.interrupted import StageInterrupted
+from cpdeform.planning.joint import polish_jointly
 from cpdeform.planning.objectives.shape import ObjectiveShape
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.phase import Phase
@@ -42,6 +43,8 @@ class StrategySculpt(Strategy):
         variations: Touches of each of two rounds of variations.
         polished: Candidates of the first step of polishing, and of the second.
         iterations: Gradient evaluations of each of them in these steps.
+        together: Stages that are polished together, before any of them is final.
+        joint_iterations: Gradient evaluations of each of them in that.
         idle: Stages without a gain in a row after which the run ends.
 
     Raises:
@@ -55,15 +58,20 @@ class StrategySculpt(Strategy):
         variations: int = 32,
         polished: tuple[int, int] = (5, 2),
         iterations: tuple[int, int] = (4, 8),
+        together: int = 4,
+        joint_iterations: int = 30,
         idle: int = 3,
     ) -> None:
         numbers = {"touches": touches, "variations": variations, "idle": idle}
+        numbers |= {"together": together, "joint_iterations": joint_iterations}
         numbers |= {"polished": min(polished), "iterations": min(iterations)}
         for name, number in numbers.items():
             if number < 1:
                 raise InputError(name, came=str(number), expected="at least 1")
         self.touches, self.variations, self.idle = touches, variations, idle
         self.polished, self.iterations = tuple(polished), tuple(iterations)
+        self.together = together
+        self._joint = TrajectoryOptimizer(iterations=joint_iterations, learning_rate=0.06, pruner=PrunerNone(), backtrack=3)
 
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
         """The placer of touches, and the loss that sees crumbs."""
@@ -86,22 +94,32 @@ class StrategySculpt(Strategy):
         )
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
-        """One touch a stage, from rest to rest; a few stages without a gain do not end the run."""
+        """One touch a stage, from rest to rest, some at a time polished together; stages without a gain do not end the run at once."""
         planner, start = from_rest(planner, start)
-        results: list[StageResult] = []
         state, warm, failures = start.state, None, 0
-        for index in range(start.first_stage, start.first_stage + start.stages):
+        finished: list[StageResult] = []
+        end = start.first_stage + start.stages
+        for first in range(start.first_stage, end, self.together):
+            found: list[StageResult] = []
             try:
-                result = planner.stage(start, index, state, results, warm=warm)
-            except StageInterrupted as interruption:
-                yield interruption.result
+                for index in range(first, min(first + self.together, end)):
+                    result = planner.stage(start, index, state, [*finished, *found], warm=warm)
+                    found.append(result)
+                    failures = 0 if result.status is Status.FINISHED else failures + 1
+                    if failures == self.idle or result.status is Status.NON_FINITE:
+                        break
+                    state, warm = result.state, result.warm
+                found = polish_jointly(planner, found, self._joint)
+            except KeyboardInterrupt as interruption:
+                yield from found
+                if isinstance(interruption, StageInterrupted):
+                    yield interruption.result
                 raise
-            results.append(result)
-            yield result
-            failures = 0 if result.status is Status.FINISHED else failures + 1
-            if failures == self.idle or result.status is Status.NON_FINITE:
+            yield from found
+            finished += found
+            if failures == self.idle or found[-1].status is Status.NON_FINITE:
                 return
-            state, warm = result.state, result.warm
+            state, warm = found[-1].state, found[-1].warm
 
 
 def from_rest(planner: Planner, start: Start) -> tuple[Planner, Start]:

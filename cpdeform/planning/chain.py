@@ -1,0 +1,173 @@
+"""Several stages as one rollout, so that a later loss can lead the actions of all of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from cpdeform.core.errors import CapabilityError, InputError
+from cpdeform.core.final_gradient import takes_final_gradient
+from cpdeform.core.scene import Manipulator
+from cpdeform.core.shapes.kinds import MANIPULATORS
+from cpdeform.core.signed_distance import signed_distance
+from cpdeform.core.simulator import RolloutGradient, Simulator, SimulatorCapabilities, Trajectory
+from cpdeform.core.state import State
+
+CLEARANCE = 5e-4
+"""Distance from the clay at which the tools of a stage begin, length units."""
+
+FARTHEST = 0.1
+"""How far a tool is moved out of the clay at most, length units."""
+
+LEAST_STEP = 5e-4
+"""The least a tool is moved at a time, length units."""
+
+
+class SimulatorChain(Simulator):
+    """A simulator whose rollout is a row of stages: between them the tools are lifted off and put to the next stage's poses.
+
+    The clay goes on as the stage before left it. A tool that would begin a stage inside it, since the stages before have changed,
+    is first moved out, against its first motion. The gradient takes that way, and the poses, as fixed numbers.
+
+    Args:
+        simulator: Computes the stages; its `vjp` has to take `grad_final_state`.
+        poses: Poses (K, M, 8) of all tools at the start of each stage.
+        rest_steps: The last environment steps of each stage, whose actions have no gradient.
+
+    Raises:
+        CapabilityError: The simulator's gradients cannot be chained.
+        InputError: There is no stage.
+    """
+
+    capabilities: ClassVar[SimulatorCapabilities] = SimulatorCapabilities(
+        differentiable=True,
+        devices=("cpu", "cuda"),
+        dtypes=(torch.float32, torch.float64),
+        manipulator_kinds=tuple(MANIPULATORS),
+        deterministic_devices=(),
+    )
+
+    def __init__(self, simulator: Simulator, *, poses: Tensor, rest_steps: int = 0) -> None:
+        if not len(poses):
+            raise InputError("poses", came="no stage", expected="at least one stage")
+        if not takes_final_gradient(simulator):
+            raise CapabilityError(
+                f"{type(simulator).__name__} cannot polish several stages together: its vjp takes no grad_final_state. "
+                "Choose another backend, or add the argument (see Simulator.vjp)."
+            )
+        super().__init__(simulator.scene, batch_size=simulator.batch_size, device=simulator.device, dtype=simulator.dtype)
+        self._simulator, self._poses, self._rest_steps = simulator, poses.to(simulator.device, simulator.dtype), rest_steps
+
+    def rollout(self, state: State, actions: Tensor) -> Trajectory:
+        """All stages, one after the other; actions (B, K T, A). The tools' poses at the end of a stage are those of the next start."""
+        stages = [state]
+        parts: list[Trajectory] = []
+        for poses, some in zip(self._poses, self._split(actions), strict=True):
+            parts.append(self._simulator.rollout(self.begin(stages[-1], poses, some), some))
+            stages.append(parts[-1].final_state)
+        return Trajectory(
+            positions=_joined([part.positions for part in parts]),
+            manipulator_poses=_joined([part.manipulator_poses for part in parts]),
+            actions=actions.detach().clone(),
+            initial_state=state,
+            final_state=parts[-1].final_state,
+            checkpoints=tuple(parts),
+        )
+
+    def vjp(
+        self,
+        trajectory: Trajectory,
+        grad_positions: Tensor,
+        grad_manipulators: Tensor | None = None,
+        *,
+        grad_final_state: State | None = None,
+    ) -> RolloutGradient:
+        """Pull gradients back through the stages, the last one first."""
+        parts: Sequence[Trajectory] = trajectory.checkpoints
+        steps, actions = parts[0].step_count, list[Tensor]()
+        final = grad_final_state
+        for number in reversed(range(len(parts))):
+            window = slice(number * steps, (number + 1) * steps + 1)
+            slopes = [grad_positions[:, window], None if grad_manipulators is None else grad_manipulators[:, window]]
+            if number < len(parts) - 1:
+                # Where two stages meet, the gradient belongs to the later one's start, and reaches the earlier one through it.
+                slopes = [None if slope is None else _without_last(slope) for slope in slopes]
+            assert slopes[0] is not None
+            found = self._simulator.vjp(parts[number], slopes[0], slopes[1], grad_final_state=final)
+            found.actions[:, steps - self._rest_steps :] = 0.0
+            actions.insert(0, found.actions)
+            start = found.initial_state
+            # The next stage's poses do not depend on where the tools were.
+            final = dataclasses.replace(start, manipulator_pose=torch.zeros_like(start.manipulator_pose))
+        return RolloutGradient(actions=torch.cat(actions, dim=1), initial_state=final if final is not None else start)
+
+    def memory_estimate(self, step_count: int, *, worlds: int | None = None) -> int:
+        """Bytes of all stages together; `step_count` is that of the whole row."""
+        each = step_count // len(self._poses)
+        return len(self._poses) * self._simulator.memory_estimate(each, worlds=worlds)
+
+    def begin(self, state: State, poses: Tensor, actions: Tensor) -> State:
+        """A stage's start: tools at poses (M, 8), those that would be inside the clay moved out of it.
+
+        Args:
+            state: Clay of B worlds.
+            poses: Poses (M, 8).
+            actions: The stage's actions (B, T, A).
+        """
+        placed = poses.repeat(state.batch_size, 1, 1)
+        for world in range(state.batch_size):
+            offset = 0
+            for index, tool in enumerate(self.scene.manipulators):
+                if tool.movable:
+                    motion = actions[world, 0, offset : offset + tool.action_size][:3] * actions.new_tensor(tool.action_scale[:3])
+                    placed[world, index] = moved_out(tool, placed[world, index], motion, state.position[world])
+                offset += tool.action_size
+        return state.with_manipulators(placed)
+
+    def _split(self, actions: Tensor) -> tuple[Tensor, ...]:
+        if actions.shape[1] % len(self._poses):
+            raise InputError(
+                "actions", came=f"{actions.shape[1]} environment steps", expected=f"a multiple of the {len(self._poses)} stages"
+            )
+        return actions.split(actions.shape[1] // len(self._poses), dim=1)
+
+
+def moved_out(tool: Manipulator, pose: Tensor, motion: Tensor, particles: Tensor) -> Tensor:
+    """A tool's pose (8,), moved against its motion until it is free of the clay, within its bounds.
+
+    Args:
+        tool: The tool.
+        pose: Pose (8,).
+        motion: Where the tool goes first (up to 3 numbers), length units; upwards where it does not move.
+        particles: The clay (N, 3), length units.
+
+    Returns:
+        The pose; unchanged where the tool is free already, or where there is no way out within `FARTHEST`.
+    """
+    direction = torch.nn.functional.pad(-motion.detach(), (0, 3 - len(motion)))
+    length = float(torch.linalg.vector_norm(direction))
+    direction = direction / length if length > 0.0 else direction.new_tensor([0.0, 1.0, 0.0])
+    found, gone = pose.clone(), 0.0
+    while (gap := float(signed_distance(tool, found, particles).min()) - CLEARANCE) < 0.0:
+        gone += max(-gap, LEAST_STEP)
+        if gone > FARTHEST:
+            return pose
+        found[:3] = pose[:3] + gone * direction
+    lower, upper = pose.new_tensor(tool.lower_bound), pose.new_tensor(tool.upper_bound)
+    found[:3] = torch.minimum(torch.maximum(found[:3], lower), upper)
+    return found
+
+
+def _joined(parts: Sequence[Tensor]) -> Tensor:
+    """Tensors (B, T + 1, ...) of stages as one (B, K T + 1, ...); where two meet, that of the later one."""
+    return torch.cat([*(part[:, :-1] for part in parts[:-1]), parts[-1]], dim=1)
+
+
+def _without_last(slope: Tensor) -> Tensor:
+    result = slope.clone()
+    result[:, -1] = 0.0
+    return result

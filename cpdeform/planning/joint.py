@@ -1,0 +1,132 @@
+"""Joint polish: one descent over the actions of several stages, each of which so far was found without knowing the next."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+
+import torch
+
+from cpdeform.core.memory_limit import check_memory
+from cpdeform.core.placer import Candidate
+from cpdeform.core.state import State
+from cpdeform.planning.algorithm import Planner
+from cpdeform.planning.chain import SimulatorChain
+from cpdeform.planning.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
+from cpdeform.planning.result import StageResult
+from cpdeform.planning.workbench import is_finite
+
+PHASE = "joint polish"
+
+
+def polish_jointly(planner: Planner, results: Sequence[StageResult], optimizer: TrajectoryOptimizer) -> list[StageResult]:
+    """Lower the loss at the end of several stages over the actions of all of them, and execute them anew.
+
+    A stage that is planned alone is done when its own loss is low. Together they can prepare each other: the first one may leave
+    clay where the second one takes it. An iteration costs a gradient a stage, and is counted so.
+
+    Args:
+        planner: The parts.
+        results: Consecutive stages; those without a plan stay as they are.
+        optimizer: How.
+
+    Returns:
+        The stages with their new plans; those given where nothing is gained.
+    """
+    planned = [result for result in results if result.actions is not None]
+    if not planned:
+        return list(results)
+    begun = time.perf_counter()
+    chain = SimulatorChain(
+        planner.simulator,
+        poses=torch.stack([_executed(result).proposal.pose for result in planned]),
+        rest_steps=planner.task.rest_steps,
+    )
+    actions = torch.cat([result.actions for result in planned if result.actions is not None]).unsqueeze(0)
+    check_memory(chain, step_count=actions.shape[1], worlds=1)
+    found = _minimize(planner, chain, planned, actions, optimizer)
+    executed = _execute(planner, chain, planned, found)
+    if executed is None or not executed[-1].loss < planned[-1].loss:
+        executed = planned
+    seconds = (time.perf_counter() - begun) / len(planned)
+    count = found.gradient_evaluations
+    polished = iter([_accounted(result, seconds, count, found if result is executed[-1] else None) for result in executed])
+    return [result if result.actions is None else next(polished) for result in results]
+
+
+def _minimize(
+    planner: Planner, chain: SimulatorChain, planned: Sequence[StageResult], actions: torch.Tensor, optimizer: TrajectoryOptimizer
+) -> OptimizationResult:
+    """The descent, told to the observers as iterations of the last stage."""
+    last = planned[-1]
+
+    def tell(iteration: Iteration) -> None:
+        for observer in planner.observers:
+            observer.iteration_finished(last.index, dataclasses.replace(iteration, phase=PHASE))
+
+    return optimizer.minimize(
+        chain,
+        planned[0].state_before,
+        actions,
+        planner.objective,
+        warm=last.warm,
+        executor=planner.executor,
+        on_iteration=tell,
+    )
+
+
+def _execute(
+    planner: Planner, chain: SimulatorChain, planned: Sequence[StageResult], found: OptimizationResult
+) -> list[StageResult] | None:
+    """Each stage executed with its new actions; None where one leaves the finite numbers."""
+    state, loss, executed = planned[0].state_before, planned[0].loss_before, list[StageResult]()
+    for result, actions in zip(planned, found.actions[0].chunk(len(planned)), strict=True):
+        before = state
+        start = chain.begin(state, _executed(result).proposal.pose.to(state.position), actions.unsqueeze(0))
+        trajectory = planner.simulator.rollout(start, actions.unsqueeze(0))
+        if not is_finite(trajectory):
+            return None
+        evaluated = planner.objective.evaluate(trajectory)
+        loss_before, loss, state = loss, float(evaluated.loss[0]), trajectory.final_state
+        executed.append(
+            dataclasses.replace(
+                result,
+                state_before=before,
+                state=state,
+                actions=trajectory.actions[0],
+                positions=trajectory.positions[0],
+                manipulator_poses=trajectory.manipulator_poses[0],
+                candidates=_with_plan(result, start, trajectory.actions[0], loss),
+                loss_before=loss_before,
+                loss=loss,
+                warm=evaluated.warm,
+                rollouts=result.rollouts + 1,
+            )
+        )
+    return executed
+
+
+def _with_plan(result: StageResult, start: State, actions: torch.Tensor, loss: float) -> tuple[Candidate, ...]:
+    """The candidates of a stage, the executed one with its new plan."""
+    proposal = dataclasses.replace(_executed(result).proposal, pose=start.manipulator_pose[0])
+    changed = dataclasses.replace(_executed(result), proposal=proposal, actions=actions, loss=loss)
+    return tuple(changed if number == result.best else candidate for number, candidate in enumerate(result.candidates))
+
+
+def _executed(result: StageResult) -> Candidate:
+    """The candidate that a stage executed."""
+    assert result.best is not None
+    return result.candidates[result.best]
+
+
+def _accounted(result: StageResult, seconds: float, count: int, found: OptimizationResult | None) -> StageResult:
+    """A stage with its share of what the joint polish took; the last stage keeps its iterations."""
+    history = () if found is None else tuple(dataclasses.replace(iteration, phase=PHASE) for iteration in found.history)
+    spent = {**result.seconds, PHASE: seconds, "total": result.seconds.get("total", 0.0) + seconds}
+    return dataclasses.replace(
+        result,
+        gradient_evaluations=result.gradient_evaluations + count,
+        history=(*result.history, *history),
+        seconds=spent,
+    )
