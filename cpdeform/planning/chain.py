@@ -11,8 +11,8 @@ from torch import Tensor
 
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.final_gradient import takes_final_gradient
-from cpdeform.core.scene import Manipulator
-from cpdeform.core.shapes.kinds import MANIPULATORS
+from cpdeform.core.scene import Tool
+from cpdeform.core.shapes.kinds import TOOLS
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.simulator import RolloutGradient, Simulator, SimulatorCapabilities, Trajectory
 from cpdeform.core.state import State
@@ -47,7 +47,7 @@ class SimulatorChain(Simulator):
         differentiable=True,
         devices=("cpu", "cuda"),
         dtypes=(torch.float32, torch.float64),
-        manipulator_kinds=tuple(MANIPULATORS),
+        tool_kinds=tuple(TOOLS),
         deterministic_devices=(),
     )
 
@@ -63,7 +63,7 @@ class SimulatorChain(Simulator):
         self._simulator, self._poses, self._rest_steps = simulator, poses.to(simulator.device, simulator.dtype), rest_steps
 
     def rollout(self, state: State, actions: Tensor) -> Trajectory:
-        """All stages, one after the other; actions (B, K T, A). The tools' poses at the end of a stage are those of the next start."""
+        """All stages, one after the other, with actions (B, K T, A); where two meet, the tools are where the later one begins."""
         stages = [state]
         parts: list[Trajectory] = []
         for poses, some in zip(self._poses, self._split(actions), strict=True):
@@ -71,7 +71,7 @@ class SimulatorChain(Simulator):
             stages.append(parts[-1].final_state)
         return Trajectory(
             positions=_joined([part.positions for part in parts]),
-            manipulator_poses=_joined([part.manipulator_poses for part in parts]),
+            tool_poses=_joined([part.tool_poses for part in parts]),
             actions=actions.detach().clone(),
             initial_state=state,
             final_state=parts[-1].final_state,
@@ -82,7 +82,7 @@ class SimulatorChain(Simulator):
         self,
         trajectory: Trajectory,
         grad_positions: Tensor,
-        grad_manipulators: Tensor | None = None,
+        grad_tools: Tensor | None = None,
         *,
         grad_final_state: State | None = None,
     ) -> RolloutGradient:
@@ -92,7 +92,7 @@ class SimulatorChain(Simulator):
         final = grad_final_state
         for number in reversed(range(len(parts))):
             window = slice(number * steps, (number + 1) * steps + 1)
-            slopes = [grad_positions[:, window], None if grad_manipulators is None else grad_manipulators[:, window]]
+            slopes = [grad_positions[:, window], None if grad_tools is None else grad_tools[:, window]]
             if number < len(parts) - 1:
                 # Where two stages meet, the gradient belongs to the later one's start, and reaches the earlier one through it.
                 slopes = [None if slope is None else _without_last(slope) for slope in slopes]
@@ -102,7 +102,7 @@ class SimulatorChain(Simulator):
             actions.insert(0, found.actions)
             start = found.initial_state
             # The next stage's poses do not depend on where the tools were.
-            final = dataclasses.replace(start, manipulator_pose=torch.zeros_like(start.manipulator_pose))
+            final = dataclasses.replace(start, tool_pose=torch.zeros_like(start.tool_pose))
         return RolloutGradient(actions=torch.cat(actions, dim=1), initial_state=final if final is not None else start)
 
     def memory_estimate(self, step_count: int, *, worlds: int | None = None) -> int:
@@ -121,22 +121,22 @@ class SimulatorChain(Simulator):
         placed = poses.repeat(state.batch_size, 1, 1)
         for world in range(state.batch_size):
             offset = 0
-            for index, tool in enumerate(self.scene.manipulators):
+            for index, tool in enumerate(self.scene.tools):
                 if tool.movable:
                     motion = actions[world, 0, offset : offset + tool.action_size][:3] * actions.new_tensor(tool.action_scale[:3])
                     placed[world, index] = moved_out(tool, placed[world, index], motion, state.position[world])
                 offset += tool.action_size
-        return state.with_manipulators(placed)
+        return state.with_tools(placed)
 
     def _split(self, actions: Tensor) -> tuple[Tensor, ...]:
         if actions.shape[1] % len(self._poses):
             raise InputError(
                 "actions", came=f"{actions.shape[1]} environment steps", expected=f"a multiple of the {len(self._poses)} stages"
             )
-        return actions.split(actions.shape[1] // len(self._poses), dim=1)
+        return actions.chunk(len(self._poses), dim=1)
 
 
-def moved_out(tool: Manipulator, pose: Tensor, motion: Tensor, particles: Tensor) -> Tensor:
+def moved_out(tool: Tool, pose: Tensor, motion: Tensor, particles: Tensor) -> Tensor:
     """A tool's pose (8,), moved against its motion until it is free of the clay, within its bounds.
 
     Args:

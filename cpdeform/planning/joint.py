@@ -96,7 +96,7 @@ def _execute(
                 state=state,
                 actions=trajectory.actions[0],
                 positions=trajectory.positions[0],
-                manipulator_poses=trajectory.manipulator_poses[0],
+                tool_poses=trajectory.tool_poses[0],
                 candidates=_with_plan(result, start, trajectory.actions[0], loss),
                 loss_before=loss_before,
                 loss=loss,
@@ -109,7 +109,7 @@ def _execute(
 
 def _with_plan(result: StageResult, start: State, actions: torch.Tensor, loss: float) -> tuple[Candidate, ...]:
     """The candidates of a stage, the executed one with its new plan."""
-    proposal = dataclasses.replace(_executed(result).proposal, pose=start.manipulator_pose[0])
+    proposal = dataclasses.replace(_executed(result).proposal, pose=start.tool_pose[0])
     changed = dataclasses.replace(_executed(result), proposal=proposal, actions=actions, loss=loss)
     return tuple(changed if number == result.best else candidate for number, candidate in enumerate(result.candidates))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -79,6 +80,10 @@ class TrajectoryOptimizer:
         pruner: Which worlds go on after each iteration; see `cpdeform.planning.pruner`.
         backtrack: Iterations without a gain after which a world goes back to its best plan, with half the step size, as it does at
             once where its loss is not finite; None for never. See `cpdeform.planning.descent.Descent`.
+        annealed: Whether the step size falls to zero along half a period of a cosine [1]_ instead of staying as it is.
+
+    References:
+        .. [1] Loshchilov, Hutter, "SGDR: Stochastic Gradient Descent with Warm Restarts", ICLR 2017.
     """
 
     iterations: int = 40
@@ -88,6 +93,7 @@ class TrajectoryOptimizer:
     initial_noise: float = 0.01
     pruner: Pruner = dataclasses.field(default_factory=PrunerHalving)
     backtrack: int | None = 4
+    annealed: bool = False
 
     def __post_init__(self) -> None:
         for name in ("iterations", "patience"):
@@ -101,6 +107,10 @@ class TrajectoryOptimizer:
     def initial_actions(self, shape: tuple[int, int, int], generator: torch.Generator) -> Tensor:
         """First actions (B, T, A): small Gaussian noise, clipped to [-1, 1]."""
         return (self.initial_noise * torch.randn(shape, generator=generator)).clamp(-1.0, 1.0)
+
+    def _rate(self, index: int) -> float:
+        """Step size of an iteration, in units of action."""
+        return self.learning_rate * (0.5 + 0.5 * math.cos(math.pi * index / self.iterations) if self.annealed else 1.0)
 
     def minimize(
         self,
@@ -143,7 +153,7 @@ class TrajectoryOptimizer:
                 evaluator,
                 executor,
                 rest_steps=rest_steps,
-                learning_rate=self.learning_rate,
+                learning_rate=self._rate(index),
                 measured=index == min(1, self.iterations - 1),
             )
             history.append(Iteration(index, self.iterations, loss, race.best_loss.clone(), seconds, memory))

@@ -9,6 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.final_gradient import takes_final_gradient
 from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
@@ -32,11 +33,15 @@ SCREENED = 10_000
 
 
 class StrategySculpt(Strategy):
-    """Each stage is one touch, the best of many.
+    """Each stage is one touch, the best of many; a few of them at a time are then polished together.
 
     A stage draws random touches, judges each by one rollout, varies the best, and polishes the best of all by gradients, in two
     steps. The loss is transport and misplaced mass. The clay is let to rest before the first touch. Where no touch gains, others
     are drawn, a few times in a row.
+
+    A touch that is planned alone serves its own loss. Once a few are found, one descent lowers the loss at their end over the
+    actions of all (`cpdeform.planning.joint`), as far as the simulator's gradients can be chained; only then are these stages
+    final.
 
     Args:
         touches: Random touches of a stage.
@@ -58,8 +63,8 @@ class StrategySculpt(Strategy):
         variations: int = 32,
         polished: tuple[int, int] = (5, 2),
         iterations: tuple[int, int] = (4, 8),
-        together: int = 4,
-        joint_iterations: int = 30,
+        together: int = 6,
+        joint_iterations: int = 40,
         idle: int = 3,
     ) -> None:
         numbers = {"touches": touches, "variations": variations, "idle": idle}
@@ -71,7 +76,9 @@ class StrategySculpt(Strategy):
         self.touches, self.variations, self.idle = touches, variations, idle
         self.polished, self.iterations = tuple(polished), tuple(iterations)
         self.together = together
-        self._joint = TrajectoryOptimizer(iterations=joint_iterations, learning_rate=0.06, pruner=PrunerNone(), backtrack=3)
+        self._joint = TrajectoryOptimizer(
+            iterations=joint_iterations, learning_rate=0.06, pruner=PrunerNone(), backtrack=3, annealed=True
+        )
 
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
         """The placer of touches, and the loss that sees crumbs."""
@@ -94,7 +101,7 @@ class StrategySculpt(Strategy):
         )
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
-        """One touch a stage, from rest to rest, some at a time polished together; stages without a gain do not end the run at once."""
+        """One touch a stage, from rest to rest, some polished together; a few stages without a gain do not end the run."""
         planner, start = from_rest(planner, start)
         state, warm, failures = start.state, None, 0
         finished: list[StageResult] = []
@@ -109,7 +116,8 @@ class StrategySculpt(Strategy):
                     if failures == self.idle or result.status is Status.NON_FINITE:
                         break
                     state, warm = result.state, result.warm
-                found = polish_jointly(planner, found, self._joint)
+                if takes_final_gradient(planner.simulator):
+                    found = polish_jointly(planner, found, self._joint)
             except KeyboardInterrupt as interruption:
                 yield from found
                 if isinstance(interruption, StageInterrupted):

@@ -1,0 +1,143 @@
+"""Joint polish of several stages, on the toy simulator with gradients that can be chained."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from cpdeform_toy.parts import OTSolverToy, PlacerToy
+from cpdeform_toy.simulator import SimulatorToy
+
+from cpdeform.core.objective import ObjectiveAutograd
+from cpdeform.core.simulator import RolloutGradient
+from cpdeform.core.task import load_task
+from cpdeform.planning.algorithm import Planner
+from cpdeform.planning.joint import PHASE, polish_jointly
+from cpdeform.planning.optimizer import TrajectoryOptimizer
+from cpdeform.planning.phases.descent import PhaseDescent
+from cpdeform.planning.pruner import PrunerNone
+from cpdeform.planning.result import Observer, Status
+from cpdeform.planning.strategies.sculpt import StrategySculpt
+from cpdeform.run.deform import deform
+
+
+class SimulatorChained(SimulatorToy):
+    """The toy, its gain fixed, with a gradient that goes back to the start: what moves the start moves the end as far."""
+
+    def gain(self, state):
+        return torch.full((state.batch_size,), 0.5).to(state.position)
+
+    def vjp(self, trajectory, grad_positions, grad_tools=None, *, grad_final_state=None) -> RolloutGradient:
+        if grad_final_state is not None:
+            grad_positions = grad_positions.clone()
+            grad_positions[:, -1] += grad_final_state.position
+        found = super().vjp(trajectory, grad_positions, grad_tools)
+        start = dataclasses.replace(found.initial_state, position=grad_positions.sum(dim=1))
+        return dataclasses.replace(found, initial_state=start)
+
+
+class Bend(ObjectiveAutograd):
+    """Distance of the centre of mass from a point that lies farther away than a stage can go."""
+
+    def loss(self, positions, tool_poses):
+        centre = positions[:, -1].mean(dim=1)
+        return (centre - centre.new_tensor([2.0, 0.5, 0.5])).square().sum(dim=-1)
+
+
+@pytest.fixture
+def task(make_toy_task):
+    return load_task(make_toy_task(stage_count=3, step_count=5))
+
+
+def planner(task, **options):
+    optimizer = TrajectoryOptimizer(iterations=2, pruner=PrunerNone())
+    return Planner(
+        task=task,
+        simulator=SimulatorChained(task.scene, batch_size=4),
+        ot_solver=OTSolverToy(),
+        placer=PlacerToy(),
+        objective=Bend(),
+        phases=(PhaseDescent(optimizer=optimizer),),
+        **options,
+    )
+
+
+OPTIMIZER = TrajectoryOptimizer(iterations=20, learning_rate=0.2, pruner=PrunerNone(), annealed=True)
+
+
+def test_stages_are_polished_together_and_hang_together(task):
+    parts = planner(task)
+    before = parts.run(stages=3).stages
+    after = polish_jointly(parts, before, OPTIMIZER)
+    assert after[-1].loss < 0.99 * before[-1].loss
+    state = before[0].state_before
+    for old, new in zip(before, after, strict=True):
+        assert torch.equal(new.state_before.position, state.position)
+        replayed = parts.simulator.rollout(state.with_tools(new.tool_poses[0][None]), new.actions[None])
+        assert torch.equal(replayed.final_state.position, new.state.position)
+        assert new.loss == pytest.approx(float(parts.objective.evaluate(replayed).loss[0]))
+        assert torch.equal(new.candidates[new.best].actions, new.actions)
+        assert new.candidates[new.best].loss == new.loss
+        # An iteration costs a gradient a stage; the execution is one more rollout.
+        assert new.gradient_evaluations == old.gradient_evaluations + OPTIMIZER.iterations
+        assert new.rollouts == old.rollouts + 1
+        state = new.state
+    assert [result.loss_before for result in after[1:]] == [result.loss for result in after[:-1]]
+    assert {iteration.phase for iteration in after[-1].history[-OPTIMIZER.iterations :]} == {PHASE}
+
+
+def test_stages_without_a_plan_stay_as_they_are(task):
+    parts = planner(task)
+    found = list(parts.run(stages=2).stages)
+    idle = dataclasses.replace(found[1], index=2, best=None, actions=None, status=Status.NO_IMPROVEMENT)
+    after = polish_jointly(parts, [*found, idle], OPTIMIZER)
+    assert after[2] is idle
+    assert after[1].loss < found[1].loss
+    assert polish_jointly(parts, [idle], OPTIMIZER) == [idle]
+
+
+def test_a_polish_that_gains_nothing_changes_no_plan(task):
+    parts = planner(task)
+    before = parts.run(stages=2).stages
+    after = polish_jointly(parts, before, dataclasses.replace(OPTIMIZER, iterations=1))
+    for old, new in zip(before, after, strict=True):
+        assert torch.equal(old.actions, new.actions)
+        assert (old.loss, old.gradient_evaluations + 1) == (new.loss, new.gradient_evaluations)
+
+
+class Interrupt(Observer):
+    """Control-C in the second iteration of the joint polish."""
+
+    def __init__(self):
+        self.told = []
+
+    def iteration_finished(self, stage, iteration):
+        if iteration.phase == PHASE and iteration.index == 1:
+            raise KeyboardInterrupt
+
+    def stage_finished(self, result):
+        self.told.append(result)
+
+
+def sculpted(task, *, simulator=SimulatorChained, **options):
+    strategy = StrategySculpt(touches=8, variations=4, iterations=(1, 1), together=2, joint_iterations=5)
+    parts = {"simulator": simulator(task.scene, batch_size=4), "ot_solver": OTSolverToy()}
+    return deform(task, strategy=strategy, settings={"objective": {"points": None}}, **parts, seed=1, **options)
+
+
+def test_the_strategy_polishes_two_stages_at_a_time(task):
+    result = sculpted(task)
+    phases = [{iteration.phase for iteration in stage.history} for stage in result.stages]
+    assert [PHASE in found for found in phases] == [False, True, True]
+    assert all(PHASE in stage.seconds for stage in result.stages)
+    alone = sculpted(task, simulator=SimulatorToy)
+    assert not any(PHASE in stage.seconds for stage in alone.stages)
+
+
+def test_an_interruption_keeps_the_stages_that_were_found(task):
+    watch = Interrupt()
+    with pytest.raises(KeyboardInterrupt):
+        sculpted(task, observers=(watch,))
+    assert [result.index for result in watch.told] == [0, 1]
+    assert all(result.status is Status.FINISHED for result in watch.told)
