@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from cpdeform.run.clearance import Clearances
     from cpdeform.run.evaluation import Evaluation
 
 
@@ -31,6 +32,7 @@ def evaluate(
 ) -> None:
     """Compute the figures that results are compared by, the same way for every method."""
     from cpdeform.core.errors import InputError
+    from cpdeform.run.clearance import measure_clearances
     from cpdeform.run.evaluation import evaluate_record
     from cpdeform.run.record import load_record
     from cpdeform.run.record_files import to_json
@@ -43,10 +45,11 @@ def evaluate(
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         result = evaluate_record(record, paper=paper or paper_blur is not None, paper_blur=paper_blur, exact=exact)
         shape = evaluate_shape_record(record, from_rest=at_rest)
+        clearances = measure_clearances(record)
     if as_json:
-        typer.echo(json.dumps(to_json({"record": str(directory), **dataclasses.asdict(result), **shape.as_dict()})))
+        typer.echo(json.dumps(to_json({"record": str(directory), **dataclasses.asdict(result), **shape.as_dict(), **dataclasses.asdict(clearances)})))
     else:
-        typer.echo(f"{_text(result)}\n{shape_text(shape)}")
+        typer.echo(f"{_text(result)}\n{shape_text(shape)}\n{_clearance_text(clearances)}")
 
 
 def _text(result: Evaluation) -> str:
@@ -66,6 +69,13 @@ def _text(result: Evaluation) -> str:
     reason = "the goal's particles are the body's" if result.corresponds else "a random sample of the goal's shape"
     lines.append(f"    floor          {result.sampling_floor:.6f}   ({reason})")
     return "\n".join(lines)
+
+
+def _clearance_text(found: Clearances) -> str:
+    names = {"start": "clay at a stage's start", "tools": "between tools", "floor": "floor", "way": "way to the next stage"}
+    values = {text: getattr(found, f"clearance_{name}") for name, text in names.items()}
+    known = [f"{text} {value:.4f}" for text, value in values.items() if value is not None]
+    return f"  least clearance  {', '.join(known) or 'nothing was executed'}"
 
 
 def _change(start: float, final: float) -> str:
