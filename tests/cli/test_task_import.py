@@ -75,10 +75,10 @@ def test_particles_have_the_masses_of_the_grid(directory, grid):
 
 def test_run_takes_the_goal_and_evaluate_its_grid(directory, grid):
     np.savez("grids.npz", **sparse(one=grid, two=grid[::-1].copy()))
-    result = invoke("grids.npz", "--name", "one", "--task", "shift.yaml", "--particles", 300, "--out", "goal.npz")
+    result = invoke("grids.npz", "--name", "one", "--task", "shift.yaml", "--particles", 300, "--out", "imported.npz")
     assert result.exit_code == 0, result.output
     parts = ["--backend", "toy", "--ot", "toy", "--placer", "toy", "--iterations", "2", "--stages", "1", "--no-pictures"]
-    run = CliRunner().invoke(app, ["run", "shift.yaml", *parts, "--goal", "goal.npz", "--out", "run", "--json"])
+    run = CliRunner().invoke(app, ["run", "shift.yaml", *parts, "--goal", "imported.npz", "--out", "run", "--json"])
     assert run.exit_code == 0, run.output
     summary = json.loads(run.stdout)
     assert summary["metric_initial"] > 0.0
@@ -99,7 +99,7 @@ def test_run_takes_the_goal_and_evaluate_its_grid(directory, grid):
 
 def test_names(directory, grid):
     np.savez("dense.npz", **{"Writer3D-v1": grid, "Move3D-v2": grid, "other": np.zeros(3)})
-    common = ("--task", "shift.yaml", "--out", "goal.npz", "--particles", 5)
+    common = ("--task", "shift.yaml", "--out", "imported.npz", "--particles", 5)
     several = invoke("dense.npz", *common)
     assert several.exit_code == 2
     assert "--name: got none, expected one of the 2 grids in dense.npz: Move3D-v2, Writer3D-v1" in several.stderr
@@ -165,15 +165,15 @@ def test_bad_grids(directory, content, message):
         path.write_bytes(content)
     elif content is not None:
         np.savez(path, **content)
-    result = invoke(path, "--task", "shift.yaml", "--out", "goal.npz")
+    result = invoke(path, "--task", "shift.yaml", "--out", "imported.npz")
     assert result.exit_code == 2, result.output
     assert message in result.stderr
-    assert not (directory / "goal.npz").exists()
+    assert not (directory / "imported.npz").exists()
 
 
 def test_bad_options(directory, grid):
     np.save("grid.npy", grid)
-    good = {"--task": "shift.yaml", "--out": "goal.npz"}
+    good = {"--task": "shift.yaml", "--out": "imported.npz"}
     cases = (
         ({"--particles": 0}, "at least 1"),
         ({"--seed": -1}, "--seed"),
@@ -217,10 +217,10 @@ def test_a_grid_of_plasticinelab(directory):
     path = SHARED / "plasticinelab" / "target_grids.npz"
     if not path.exists():
         pytest.skip(f"no {path}; set CPDEFORM_SHARED to the folder that holds plasticinelab/")
-    result = invoke(path, "--name", "Writer3D-v1", "--particles", 3000, "--out", "goal.npz")
+    result = invoke(path, "--name", "Writer3D-v1", "--particles", 3000, "--out", "imported.npz")
     assert result.exit_code == 0, result.output
     scene = load_task("writer-v1").scene
-    masses = mass_grid(torch.as_tensor(load_goal(directory / "goal.npz", scene=scene)), scene).numpy()
-    kept = load_goal_grid(directory / "goal.npz", scene=scene)
+    masses = mass_grid(torch.as_tensor(load_goal(directory / "imported.npz", scene=scene)), scene).numpy()
+    kept = load_goal_grid(directory / "imported.npz", scene=scene)
     assert kept.sum() == pytest.approx(3000 * scene.particle_volume, rel=1e-5)
     assert np.abs(masses - kept).sum() / kept.sum() < 0.02
