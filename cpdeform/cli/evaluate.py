@@ -47,7 +47,8 @@ def evaluate(
         shape = evaluate_shape_record(record, from_rest=at_rest)
         clearances = measure_clearances(record)
     if as_json:
-        typer.echo(json.dumps(to_json({"record": str(directory), **dataclasses.asdict(result), **shape.as_dict(), **dataclasses.asdict(clearances)})))
+        figures = {**dataclasses.asdict(result), **shape.as_dict(), **dataclasses.asdict(clearances)}
+        typer.echo(json.dumps(to_json({"record": str(directory), **figures})))
     else:
         typer.echo(f"{_text(result)}\n{shape_text(shape)}\n{_clearance_text(clearances)}")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -127,7 +128,7 @@ def _above_floor(scene: Scene, surfaces: Sequence[Tensor], paths: Tensor, floor:
 
 def _on_the_way(scene: Scene, stages: Sequence[StageResult]) -> Iterator[float]:
     """Least distance from the clay of each movable tool between each stage and the next."""
-    for stage, after in zip(stages[:-1], stages[1:], strict=True):
+    for stage, after in itertools.pairwise(stages):
         clay, ends = _executed(stage)
         _, starts = _executed(after)
         pairs = zip(_movable(scene, ends[-1]), _movable(scene, starts[0]), strict=True)

@@ -41,9 +41,8 @@ def record(*stages):
 
 def test_distances_of_balls_from_corners_each_other_and_the_floor():
     far = (0.75, 0.3, 0.5)
-    found = measure_clearances(
-        record(stage(((0.35, 0.05, 0.45), far), ((0.35, 0.08, 0.45), far)), stage(((0.37, 0.2, 0.45), far), ((0.60, 0.2, 0.5), far)))
-    )
+    first = stage(((0.35, 0.05, 0.45), far), ((0.35, 0.08, 0.45), far))
+    found = measure_clearances(record(first, stage(((0.37, 0.2, 0.45), far), ((0.60, 0.2, 0.5), far))))
     # The first ball is 0.1 from the nearest corner at the first start, and nearer at the second one.
     second = ((0.45 - 0.37) ** 2 + 0.05**2) ** 0.5
     assert found.clearance_start == pytest.approx(min(0.1, second) - 0.04, abs=1e-6)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from torch import Tensor
@@ -103,19 +103,13 @@ class StrategySculpt(Strategy):
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
         """One touch a stage, from rest to rest, some polished together; a few stages without a gain do not end the run."""
         planner, start = from_rest(planner, start)
-        state, warm, failures = start.state, None, 0
         finished: list[StageResult] = []
         end = start.first_stage + start.stages
         for first in range(start.first_stage, end, self.together):
             found: list[StageResult] = []
             try:
-                for index in range(first, min(first + self.together, end)):
-                    result = planner.stage(start, index, state, [*finished, *found], warm=warm)
+                for result in self._touches(planner, start, range(first, min(first + self.together, end)), finished):
                     found.append(result)
-                    failures = 0 if result.status is Status.FINISHED else failures + 1
-                    if failures == self.idle or result.status is Status.NON_FINITE:
-                        break
-                    state, warm = result.state, result.warm
                 if takes_final_gradient(planner.simulator):
                     found = polish_jointly(planner, found, self._joint)
             except KeyboardInterrupt as interruption:
@@ -125,9 +119,24 @@ class StrategySculpt(Strategy):
                 raise
             yield from found
             finished += found
-            if failures == self.idle or found[-1].status is Status.NON_FINITE:
+            if self._is_over(finished):
                 return
-            state, warm = found[-1].state, found[-1].warm
+
+    def _touches(self, planner: Planner, start: Start, stages: range, finished: Sequence[StageResult]) -> Iterator[StageResult]:
+        """Stages one after the other, each by itself."""
+        before = list(finished)
+        for index in stages:
+            state, warm = (before[-1].state, before[-1].warm) if before else (start.state, None)
+            before.append(planner.stage(start, index, state, before, warm=warm))
+            yield before[-1]
+            if self._is_over(before):
+                return
+
+    def _is_over(self, results: Sequence[StageResult]) -> bool:
+        """Whether the last stages gained nothing, or the last one broke."""
+        last = results[-self.idle :]
+        stuck = len(last) == self.idle and all(result.status is not Status.FINISHED for result in last)
+        return stuck or results[-1].status is Status.NON_FINITE
 
 
 def from_rest(planner: Planner, start: Start) -> tuple[Planner, Start]:
