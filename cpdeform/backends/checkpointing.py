@@ -45,6 +45,11 @@ class SimulatorCheckpointing(Simulator):
         self.threads = available_cores() if threads is None else whole_number("threads", threads, least=1, most=MOST_THREADS)
         self.memory_budget = whole_number("memory_budget", memory_budget, least=0, most=2**60)
 
+    def for_scene(self, scene: Scene) -> Simulator:
+        """See `Simulator`; threads and memory budget stay, too."""
+        options = {"threads": self.threads, "memory_budget": self.memory_budget}
+        return type(self)(scene, batch_size=self.batch_size, device=self.device, dtype=self.dtype, **options)
+
     def _own(self, tensor: Tensor) -> Tensor:
         """A copy of a tensor on the simulator's device and in its type, which the caller cannot write to."""
         return tensor.detach().to(device=self.device, dtype=self.dtype, copy=True, memory_format=torch.contiguous_format)

@@ -214,6 +214,19 @@ class Simulator(abc.ABC):
             Bytes; within a fifth of what is measured while the bodies stay about as large as they are at the start.
         """
 
+    def for_scene(self, scene: Scene) -> Simulator:
+        """A simulator of another scene with the same batch size, device and type.
+
+        Backends with options of their own hand them on.
+
+        Args:
+            scene: What to simulate.
+
+        Raises:
+            CapabilityError: The backend does not support a tool of the scene.
+        """
+        return type(self)(scene, batch_size=self.batch_size, device=self.device, dtype=self.dtype)
+
     def release_memory(self) -> None:  # noqa: B027 - most backends keep nothing
         """Give back to the system what is kept between rollouts to be used again; trajectories stay usable."""
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.final_gradient import takes_final_gradient
-from cpdeform.core.scene import Tool
+from cpdeform.core.scene import Scene, Tool
 from cpdeform.core.shapes.kinds import TOOLS
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.simulator import RolloutGradient, Simulator, SimulatorCapabilities, Trajectory
@@ -67,7 +67,7 @@ class SimulatorChain(Simulator):
         stages = [state]
         parts: list[Trajectory] = []
         for poses, some in zip(self._poses, self._split(actions), strict=True):
-            parts.append(self._simulator.rollout(self.begin(stages[-1], poses, some), some))
+            parts.append(self._simulator.rollout(begin_stage(self.scene, stages[-1], poses, some), some))
             stages.append(parts[-1].final_state)
         return Trajectory(
             positions=_joined([part.positions for part in parts]),
@@ -110,30 +110,32 @@ class SimulatorChain(Simulator):
         each = step_count // len(self._poses)
         return len(self._poses) * self._simulator.memory_estimate(each, worlds=worlds)
 
-    def begin(self, state: State, poses: Tensor, actions: Tensor) -> State:
-        """A stage's start: tools at poses (M, 8), those that would be inside the clay moved out of it.
-
-        Args:
-            state: Clay of B worlds.
-            poses: Poses (M, 8).
-            actions: The stage's actions (B, T, A).
-        """
-        placed = poses.repeat(state.batch_size, 1, 1)
-        for world in range(state.batch_size):
-            offset = 0
-            for index, tool in enumerate(self.scene.tools):
-                if tool.movable:
-                    motion = actions[world, 0, offset : offset + tool.action_size][:3] * actions.new_tensor(tool.action_scale[:3])
-                    placed[world, index] = moved_out(tool, placed[world, index], motion, state.position[world])
-                offset += tool.action_size
-        return state.with_tools(placed)
-
     def _split(self, actions: Tensor) -> tuple[Tensor, ...]:
         if actions.shape[1] % len(self._poses):
             raise InputError(
                 "actions", came=f"{actions.shape[1]} environment steps", expected=f"a multiple of the {len(self._poses)} stages"
             )
         return actions.chunk(len(self._poses), dim=1)
+
+
+def begin_stage(scene: Scene, state: State, poses: Tensor, actions: Tensor) -> State:
+    """A stage's start: tools at their poses, those that would be inside the clay moved out of it.
+
+    Args:
+        scene: The tools.
+        state: Clay of B worlds.
+        poses: Poses (M, 8).
+        actions: The stage's actions (B, T, A).
+    """
+    placed = poses.to(state.position).repeat(state.batch_size, 1, 1)
+    for world in range(state.batch_size):
+        offset = 0
+        for index, tool in enumerate(scene.tools):
+            if tool.movable:
+                motion = actions[world, 0, offset : offset + tool.action_size][:3] * actions.new_tensor(tool.action_scale[:3])
+                placed[world, index] = moved_out(tool, placed[world, index], motion, state.position[world])
+            offset += tool.action_size
+    return state.with_tools(placed)
 
 
 def moved_out(tool: Tool, pose: Tensor, motion: Tensor, particles: Tensor) -> Tensor:

@@ -12,7 +12,8 @@ from cpdeform.core.memory_limit import check_memory
 from cpdeform.core.placer import Candidate
 from cpdeform.core.state import State
 from cpdeform.planning.algorithm import Planner
-from cpdeform.planning.chain import SimulatorChain
+from cpdeform.planning.chain import SimulatorChain, begin_stage
+from cpdeform.planning.coarse import CoarsePlanner
 from cpdeform.planning.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
 from cpdeform.planning.result import StageResult
 from cpdeform.planning.workbench import is_finite
@@ -20,7 +21,14 @@ from cpdeform.planning.workbench import is_finite
 PHASE = "joint polish"
 
 
-def polish_jointly(planner: Planner, results: Sequence[StageResult], optimizer: TrajectoryOptimizer) -> list[StageResult]:
+def polish_jointly(
+    planner: Planner,
+    results: Sequence[StageResult],
+    optimizer: TrajectoryOptimizer,
+    *,
+    coarse: CoarsePlanner | None = None,
+    coarse_optimizer: TrajectoryOptimizer | None = None,
+) -> list[StageResult]:
     """Lower the loss at the end of several stages over the actions of all of them, and execute them anew.
 
     A stage that is planned alone is done when its own loss is low. Together they can prepare each other: the first one may leave
@@ -30,6 +38,8 @@ def polish_jointly(planner: Planner, results: Sequence[StageResult], optimizer: 
         planner: The parts.
         results: Consecutive stages; those without a plan stay as they are.
         optimizer: How.
+        coarse: Descends with fewer particles first; None for none.
+        coarse_optimizer: How; defaults to `optimizer`.
 
     Returns:
         The stages with their new plans; those given where nothing is gained.
@@ -38,52 +48,48 @@ def polish_jointly(planner: Planner, results: Sequence[StageResult], optimizer: 
     if not planned:
         return list(results)
     begun = time.perf_counter()
-    chain = SimulatorChain(
-        planner.simulator,
-        poses=torch.stack([_executed(result).proposal.pose for result in planned]),
-        rest_steps=planner.task.rest_steps,
-    )
     actions = torch.cat([result.actions for result in planned if result.actions is not None]).unsqueeze(0)
-    check_memory(chain, step_count=actions.shape[1], worlds=1)
-    found = _minimize(planner, chain, planned, actions, optimizer)
-    executed = _execute(planner, chain, planned, found)
+    spent: list[OptimizationResult] = []
+    if coarse is not None:
+        begin = coarse.model.thinned(planned[0].state_before)
+        spent.append(_minimize(coarse.coarse, begin, planned, actions, coarse_optimizer or optimizer, warm=None))
+        actions = spent[0].actions.to(actions)
+    spent.append(_minimize(planner, planned[0].state_before, planned, actions, optimizer, warm=planned[-1].warm))
+    executed = _execute(planner, planned, spent[-1])
     if executed is None or not executed[-1].loss < planned[-1].loss:
         executed = planned
     seconds = (time.perf_counter() - begun) / len(planned)
-    count = found.gradient_evaluations
-    polished = iter([_accounted(result, seconds, count, found if result is executed[-1] else None) for result in executed])
+    polished = iter([_accounted(result, seconds, spent, last=result is executed[-1]) for result in executed])
     return [result if result.actions is None else next(polished) for result in results]
 
 
 def _minimize(
-    planner: Planner, chain: SimulatorChain, planned: Sequence[StageResult], actions: torch.Tensor, optimizer: TrajectoryOptimizer
+    planner: Planner,
+    state: State,
+    planned: Sequence[StageResult],
+    actions: torch.Tensor,
+    optimizer: TrajectoryOptimizer,
+    *,
+    warm: tuple[object, ...] | None,
 ) -> OptimizationResult:
-    """The descent, told to the observers as iterations of the last stage."""
-    last = planned[-1]
+    """The descent from a state, told to the observers as iterations of the last stage."""
+    poses = torch.stack([_executed(result).proposal.pose for result in planned])
+    chain = SimulatorChain(planner.simulator, poses=poses, rest_steps=planner.task.rest_steps)
+    check_memory(chain, step_count=actions.shape[1], worlds=1)
 
     def tell(iteration: Iteration) -> None:
         for observer in planner.observers:
-            observer.iteration_finished(last.index, dataclasses.replace(iteration, phase=PHASE))
+            observer.iteration_finished(planned[-1].index, dataclasses.replace(iteration, phase=PHASE))
 
-    return optimizer.minimize(
-        chain,
-        planned[0].state_before,
-        actions,
-        planner.objective,
-        warm=last.warm,
-        executor=planner.executor,
-        on_iteration=tell,
-    )
+    return optimizer.minimize(chain, state, actions, planner.objective, warm=warm, executor=planner.executor, on_iteration=tell)
 
 
-def _execute(
-    planner: Planner, chain: SimulatorChain, planned: Sequence[StageResult], found: OptimizationResult
-) -> list[StageResult] | None:
+def _execute(planner: Planner, planned: Sequence[StageResult], found: OptimizationResult) -> list[StageResult] | None:
     """Each stage executed with its new actions; None where one leaves the finite numbers."""
     state, loss, executed = planned[0].state_before, planned[0].loss_before, list[StageResult]()
     for result, actions in zip(planned, found.actions[0].chunk(len(planned)), strict=True):
         before = state
-        start = chain.begin(state, _executed(result).proposal.pose.to(state.position), actions.unsqueeze(0))
+        start = begin_stage(planner.task.scene, state, _executed(result).proposal.pose, actions.unsqueeze(0))
         trajectory = planner.simulator.rollout(start, actions.unsqueeze(0))
         if not is_finite(trajectory):
             return None
@@ -120,13 +126,12 @@ def _executed(result: StageResult) -> Candidate:
     return result.candidates[result.best]
 
 
-def _accounted(result: StageResult, seconds: float, count: int, found: OptimizationResult | None) -> StageResult:
+def _accounted(result: StageResult, seconds: float, spent: Sequence[OptimizationResult], *, last: bool) -> StageResult:
     """A stage with its share of what the joint polish took; the last stage keeps its iterations."""
-    history = () if found is None else tuple(dataclasses.replace(iteration, phase=PHASE) for iteration in found.history)
-    spent = {**result.seconds, PHASE: seconds, "total": result.seconds.get("total", 0.0) + seconds}
+    iterations = [iteration for found in spent for iteration in found.history] if last else []
     return dataclasses.replace(
         result,
-        gradient_evaluations=result.gradient_evaluations + count,
-        history=(*result.history, *history),
-        seconds=spent,
+        gradient_evaluations=result.gradient_evaluations + sum(found.gradient_evaluations for found in spent),
+        history=(*result.history, *(dataclasses.replace(iteration, phase=PHASE) for iteration in iterations)),
+        seconds={**result.seconds, PHASE: seconds, "total": result.seconds.get("total", 0.0) + seconds},
     )
