@@ -124,10 +124,10 @@ def begin_stage(scene: Scene, state: State, poses: Tensor, actions: Tensor) -> S
     Args:
         scene: The tools.
         state: Clay of B worlds.
-        poses: Poses (M, 8).
+        poses: Poses (M, 8), or (B, M, 8) where the worlds differ.
         actions: The stage's actions (B, T, A).
     """
-    placed = poses.to(state.position).repeat(state.batch_size, 1, 1)
+    placed = poses.to(state.position).expand(state.batch_size, -1, -1).clone()
     for world in range(state.batch_size):
         offset = 0
         for index, tool in enumerate(scene.tools):

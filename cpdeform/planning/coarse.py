@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -12,12 +11,13 @@ from torch import Tensor
 
 from cpdeform.core.placer import Candidate
 from cpdeform.core.scene import Scene
-from cpdeform.core.simulator import Simulator, Trajectory
+from cpdeform.core.simulator import Simulator
 from cpdeform.core.state import State
 from cpdeform.planning.algorithm import Planner, Start
 from cpdeform.planning.chain import begin_stage
 from cpdeform.planning.interrupted import StageInterrupted
 from cpdeform.planning.objectives.shape import ObjectiveShape
+from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.result import StageResult, Status
 from cpdeform.planning.still import still_trajectory
 from cpdeform.planning.workbench import is_finite
@@ -26,8 +26,8 @@ PARTICLES_PER_CELL = 1.7
 """Particles per cell of the grid that a coarse scene keeps. Of 64 touches on `star`, whose 10,000 particles fill a cell by 6.7, a
 quarter of them ranks the losses as all do (Spearman 0.92) in a third of the time, and takes a fifth for a gradient."""
 
-MOST_EXECUTED = 3
-"""Plans of a coarse stage that are tried with all particles."""
+MOST_POLISHED = 3
+"""Plans of a coarse stage that are polished with all particles."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -78,20 +78,23 @@ class CoarsePlanner:
         coarse: The same parts for the coarse model.
         start: Goal and stages of the run, for the coarse model.
         model: The coarse model.
+        polish: How the best plans of a coarse stage are polished with all particles.
     """
 
     full: Planner
     coarse: Planner
     start: Start
     model: CoarseModel
+    polish: TrajectoryOptimizer
 
     @classmethod
-    def of(cls, planner: Planner, start: Start) -> CoarsePlanner | None:
+    def of(cls, planner: Planner, start: Start, *, polish: TrajectoryOptimizer) -> CoarsePlanner | None:
         """The coarse parts of a run; None where there is no coarse model, or the loss is not made for one.
 
         Args:
             planner: The parts.
-            start: Goal, and the state that the loss is measured from.
+            start: Goal and state.
+            polish: How the best plans of a coarse stage are polished with all particles.
         """
         model, objective = CoarseModel.of(planner.simulator), planner.objective
         if model is None or not isinstance(objective, ObjectiveShape):
@@ -105,10 +108,11 @@ class CoarsePlanner:
             simulator=model.simulator,
             objective=objective.rebased(goal=goal, start=objective.start[model.kept]),
         )
-        return cls(full=planner, coarse=coarse, start=dataclasses.replace(start, state=begin, goal=goal), model=model)
+        begun = dataclasses.replace(start, state=begin, goal=goal)
+        return cls(full=planner, coarse=coarse, start=begun, model=model, polish=polish)
 
     def stage(self, index: int, state: State, *, warm: tuple[object, ...] | None = None) -> StageResult:
-        """Plan a stage coarsely; of its best plans, execute the one that is best with all particles.
+        """Plan a stage coarsely, polish its best plans with all particles, and execute the best of them.
 
         Args:
             index: Number of the stage.
@@ -127,68 +131,88 @@ class CoarsePlanner:
             raise StageInterrupted(dataclasses.replace(result, status=Status.INTERRUPTED)) from interruption
 
     def _executed(self, found: StageResult, state: State, warm: tuple[object, ...] | None) -> StageResult:
-        """A coarse stage with the best of its plans executed with all particles."""
+        """A coarse stage whose best plans are polished with all particles, and the best of them executed."""
         begun = time.perf_counter()
         still = still_trajectory(state, self.full.task.rollout_steps, scene=self.full.task.scene)
         before = self.full.objective.evaluate(still, warm)
-        order = sorted(range(len(found.candidates)), key=lambda number: found.candidates[number].loss)[:MOST_EXECUTED]
-        tried = {
-            number: self._execute(found.candidates[number], state) for number in order if found.candidates[number].actions.numel()
-        }
-        losses = {number: loss for number, (_, loss, _) in tried.items()}
-        best = min(losses, key=lambda number: losses[number], default=None)
-        gained = best is not None and losses[best] < float(before.loss[0])
+        candidates, count = self._polished(found, state, before.warm)
         result = dataclasses.replace(
             found,
-            status=_status(found, losses, gained=gained),
+            status=Status.NO_IMPROVEMENT if found.status is Status.FINISHED else found.status,
             state_before=state,
             state=state,
             priorities=self._priorities(found.priorities, state),
-            candidates=self._candidates(found.candidates, losses),
+            candidates=candidates,
             best=None,
             actions=None,
             positions=None,
             tool_poses=None,
             loss_before=float(before.loss[0]),
             loss=float(before.loss[0]),
-            rollouts=found.rollouts + len(tried),
+            gradient_evaluations=found.gradient_evaluations + count,
             warm=before.warm,
         )
+        best = min(range(len(candidates)), key=lambda number: candidates[number].loss, default=None)
+        if best is not None and candidates[best].loss < result.loss:
+            result = self._execute(result, best)
         result.seconds["execution"] = result.seconds.get("execution", 0.0) + time.perf_counter() - begun
-        if best is None or not gained:
+        return result
+
+    def _polished(self, found: StageResult, state: State, warm: tuple[object, ...] | None) -> tuple[tuple[Candidate, ...], int]:
+        """All candidates, the best few with plans and losses of all particles and the others out of the race; gradients spent."""
+        whole = [self._whole(candidate) for candidate in found.candidates]
+        order = sorted(range(len(whole)), key=lambda number: whole[number].loss)
+        chosen = [number for number in order if whole[number].actions.numel() and np.isfinite(whole[number].loss)][:MOST_POLISHED]
+        candidates = [dataclasses.replace(candidate, loss=float("inf")) for candidate in whole]
+        if not chosen:
+            return tuple(candidates), 0
+        actions = torch.stack([whole[number].actions for number in chosen]).to(state.position)
+        poses = torch.stack([whole[number].proposal.pose for number in chosen])
+        start = begin_stage(self.full.task.scene, state.fork(len(chosen)), poses, actions)
+        descent = self.polish.minimize(
+            self.full.simulator,
+            start,
+            actions,
+            self.full.objective,
+            rest_steps=self.full.task.rest_steps,
+            warm=None if warm is None else list(warm) * len(chosen),
+            executor=self.full.executor,
+        )
+        for place, number in enumerate(chosen):
+            proposal = dataclasses.replace(whole[number].proposal, pose=start.tool_pose[place])
+            loss, plan = float(descent.loss[place]), descent.actions[place]
+            candidates[number] = dataclasses.replace(whole[number], proposal=proposal, loss=loss, actions=plan)
+        return tuple(candidates), descent.gradient_evaluations
+
+    def _execute(self, result: StageResult, best: int) -> StageResult:
+        """The stage with a plan executed, if it gains with its loss computed from scratch, too."""
+        candidate, state = result.candidates[best], result.state_before
+        start = state.with_tools(candidate.proposal.pose.unsqueeze(0))
+        trajectory = self.full.simulator.rollout(start, candidate.actions.unsqueeze(0).to(state.position))
+        result = dataclasses.replace(result, rollouts=result.rollouts + 1)
+        if not is_finite(trajectory):
+            return dataclasses.replace(result, status=Status.NON_FINITE)
+        evaluated = self.full.objective.evaluate(trajectory)
+        loss = float(evaluated.loss[0])
+        if not loss < result.loss_before:
             return result
-        trajectory, loss, after = tried[best]
         return dataclasses.replace(
             result,
+            status=Status.FINISHED,
             state=trajectory.final_state,
             best=best,
             actions=trajectory.actions[0],
             positions=trajectory.positions[0],
             tool_poses=trajectory.tool_poses[0],
             loss=loss,
-            warm=after,
+            warm=evaluated.warm,
         )
 
-    def _execute(self, candidate: Candidate, state: State) -> tuple[Trajectory, float, tuple[object, ...] | None]:
-        """A plan with all particles: trajectory, loss (infinite where it is not finite), and what the loss can start from then."""
-        actions = candidate.actions.unsqueeze(0).to(state.position)
-        trajectory = self.full.simulator.rollout(
-            begin_stage(self.full.task.scene, state, candidate.proposal.pose, actions), actions
-        )
-        if not is_finite(trajectory):
-            return trajectory, float("inf"), None
-        evaluated = self.full.objective.evaluate(trajectory)
-        return trajectory, float(evaluated.loss[0]), evaluated.warm
-
-    def _candidates(self, candidates: Sequence[Candidate], losses: dict[int, float]) -> tuple[Candidate, ...]:
-        """The candidates with contact particles of the whole scene, those that were executed with their loss there."""
-        result = []
-        for number, candidate in enumerate(candidates):
-            contact = candidate.proposal.contact_particle
-            whole = None if contact is None else int(self.model.kept[contact])
-            proposal = dataclasses.replace(candidate.proposal, contact_particle=whole)
-            result.append(dataclasses.replace(candidate, proposal=proposal, loss=losses.get(number, candidate.loss)))
-        return tuple(result)
+    def _whole(self, candidate: Candidate) -> Candidate:
+        """A candidate with the number that its contact particle has in the whole scene."""
+        contact = candidate.proposal.contact_particle
+        whole = None if contact is None else int(self.model.kept[contact])
+        return dataclasses.replace(candidate, proposal=dataclasses.replace(candidate.proposal, contact_particle=whole))
 
     def _priorities(self, priorities: Tensor, state: State) -> Tensor:
         """Priorities (N,) of all particles: those of the nearest one that was kept."""
@@ -197,11 +221,3 @@ class CoarsePlanner:
         position = state.position[0].detach().cpu().numpy()
         _, nearest = cKDTree(position[self.model.kept.cpu().numpy()]).query(position)
         return priorities[torch.as_tensor(np.asarray(nearest)).to(priorities.device)]
-
-
-def _status(found: StageResult, losses: dict[int, float], *, gained: bool) -> Status:
-    if gained:
-        return Status.FINISHED
-    if not losses or found.status is Status.NO_PLACEMENT:
-        return found.status if found.status is not Status.FINISHED else Status.NO_IMPROVEMENT
-    return Status.NO_IMPROVEMENT if any(np.isfinite(loss) for loss in losses.values()) else Status.NON_FINITE

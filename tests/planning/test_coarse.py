@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 from cpdeform_toy.parts import OTSolverToy, PlacerToy
@@ -29,10 +30,13 @@ SCENE = {
 }
 
 
+POLISH = TrajectoryOptimizer(iterations=2, learning_rate=0.05, pruner=PrunerNone())
+
+
 @pytest.fixture
 def task(make_toy_task):
     task = load_task(make_toy_task(scene=SCENE, stage_count=2, step_count=5))
-    write_goal(task.goal, sample_particles(task.scene) + [0.05, 0.0, 0.0])
+    write_goal(task.goal, sample_particles(task.scene) + np.array([0.05, 0.0, 0.0]))
     return task
 
 
@@ -78,13 +82,13 @@ def test_few_particles_are_not_thinned_out(task):
     assert 400 / (0.001 * 64**3) / PARTICLES_PER_CELL < 1.5
     assert CoarseModel.of(SimulatorToy(few)) is None
     parts = dataclasses.replace(planner(task), objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_goal())))
-    assert CoarsePlanner.of(parts, beginning(parts)) is None
+    assert CoarsePlanner.of(parts, beginning(parts), polish=POLISH) is None
 
 
 def test_a_stage_is_executed_with_all_particles(task):
     parts = planner(task)
     start = beginning(parts)
-    result = CoarsePlanner.of(parts, start).stage(0, start.state)
+    result = CoarsePlanner.of(parts, start, polish=POLISH).stage(0, start.state)
     assert result.status is Status.FINISHED
     assert result.state.position.shape == start.state.position.shape
     assert result.priorities.shape == (1801,)
@@ -109,7 +113,7 @@ def test_an_interrupted_stage_keeps_its_best_plan_with_all_particles(task):
     parts = planner(task, observers=(Interrupt(),))
     start = beginning(parts)
     with pytest.raises(StageInterrupted) as caught:
-        CoarsePlanner.of(parts, start).stage(0, start.state)
+        CoarsePlanner.of(parts, start, polish=POLISH).stage(0, start.state)
     result = caught.value.result
     assert result.status is Status.INTERRUPTED
     assert result.positions.shape[1] == 1801

@@ -33,6 +33,10 @@ SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
 
 
+FULL_ITERATIONS = 5
+"""Gradient evaluations, with all particles, of each of the best plans of a coarse stage."""
+
+
 class StrategySculpt(Strategy):
     """Each stage is one touch, the best of many; a few of them at a time are then polished together.
 
@@ -103,7 +107,8 @@ class StrategySculpt(Strategy):
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
         """One touch a stage, from rest to rest, some polished together; a few stages without a gain do not end the run."""
         planner, start = from_rest(planner, start)
-        coarse = CoarsePlanner.of(planner, start) if self.coarse else None
+        polish = TrajectoryOptimizer(iterations=FULL_ITERATIONS, learning_rate=0.05, pruner=PrunerNone(), backtrack=3)
+        coarse = CoarsePlanner.of(planner, start, polish=polish) if self.coarse else None
         finished: list[StageResult] = []
         end = start.first_stage + start.stages
         for first in range(start.first_stage, end, self.together):
