@@ -14,7 +14,7 @@ LAYERS = (
     ("core",),
     ("planning", "ot", "backends", "placement"),
     ("run",),
-    ("testing", "report"),
+    ("testing", "report", "sweep"),
     ("experiments", "tasks"),
     ("cli",),
 )

@@ -18,6 +18,7 @@ from cpdeform.cli.interruption import exit_code, interruptible
 from cpdeform.cli.plugins import plugins
 from cpdeform.cli.run import run
 from cpdeform.cli.strategies import strategies
+from cpdeform.cli.sweep import sweep
 from cpdeform.cli.system_limits import system_limit
 from cpdeform.cli.task import task
 from cpdeform.cli.tasks import tasks
@@ -74,6 +75,7 @@ app.command()(strategies)
 app.command()(experiment)
 app.command()(plugins)
 app.add_typer(task, name="task")
+app.add_typer(sweep, name="sweep")
 app.add_typer(bench, name="bench")
 app.add_typer(check, name="check")
 
