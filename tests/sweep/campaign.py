@@ -25,7 +25,7 @@ from cpdeform.sweep.queue import CLAIMS, Queue
 from cpdeform.sweep.status import sweep_status
 from cpdeform.sweep.worker import Worker
 
-STAGES = 6
+STAGES = 3
 TIMES = frozenset({"seconds", "recorded_at", "memory", "rollout", "objective", "vjp", "optimizer"})
 """Fields of a record that no two runs have in common."""
 

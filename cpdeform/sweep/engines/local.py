@@ -139,7 +139,7 @@ def main() -> None:
     shard = None if given["shard"] is None else tuple(given["shard"])
     settings = WorkSettings(**{**given, "shard": shard})
     with answers, contextlib.suppress(KeyboardInterrupt):
-        for outcome in Worker(Queue(Path(request["directory"])), settings, identity=request["identity"]).work():
+        for outcome in Worker(Queue(Path(request["directory"])), settings, identity=request["identity"], own_process=True).work():
             answers.write(json.dumps(dataclasses.asdict(outcome)) + "\n")
             answers.flush()
 
