@@ -12,7 +12,7 @@ import shutil
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,6 +47,7 @@ class WorkSettings:
         stale_after: Seconds without a heartbeat after which a worker counts as dead.
         attempts: Workers that may die on a job before it counts as failed.
         shard: Number of the part of the jobs that is to be done, from 0, and how many parts there are; None for all jobs.
+        only: Names of the jobs that are to be done; None for all.
 
     Raises:
         InputError: A number is out of range.
@@ -55,6 +56,7 @@ class WorkSettings:
     stale_after: float = STALE_AFTER
     attempts: int = ATTEMPTS_ALLOWED
     shard: tuple[int, int] | None = None
+    only: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.stale_after) and self.stale_after > 0):
@@ -66,8 +68,14 @@ class WorkSettings:
             raise InputError("--shard", came=came, expected="i/n with i from 0 to n - 1, such as 0/4")
 
     def own(self, names: Sequence[str]) -> list[str]:
-        """Of all names of a sweep, in order, those of the shard."""
-        return list(names) if self.shard is None else list(names[self.shard[0] :: self.shard[1]])
+        """Of all names of a sweep, in order, those that are to be done."""
+        wanted = list(names) if self.only is None else list(self.only)
+        return wanted if self.shard is None else wanted[self.shard[0] :: self.shard[1]]
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> WorkSettings:
+        """Settings as `dataclasses.asdict` gives them, after a way through JSON."""
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in content.items()})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -228,7 +236,9 @@ def return_lost(queue: Queue, settings: WorkSettings, *, worker: str | None = No
 
 
 def settle(claim: Claim, job: Job) -> None:
-    """Put what came of a job where it belongs, in place of what was there; nothing, if nothing came of it."""
+    """Put what came of a job where it belongs, in place of an earlier record; nothing, if nothing came of it."""
+    from cpdeform.run.record_files import own_files
+
     place, attempt = claim.queue.directory / job.record, claim.attempt
     if not attempt.is_dir() or not any(attempt.iterdir()):
         shutil.rmtree(attempt, ignore_errors=True)
@@ -237,6 +247,10 @@ def settle(claim: Claim, job: Job) -> None:
     old = claim.queue.place(ATTEMPTS) / f".old-{os.urandom(6).hex()}"
     with contextlib.suppress(FileNotFoundError):
         place.rename(old)
+        for path in set(old.iterdir()) - set(own_files(old)):
+            # What somebody else has put there is not ours to remove.
+            if not (attempt / path.name).exists():
+                path.rename(attempt / path.name)
     attempt.rename(place)
     shutil.rmtree(old, ignore_errors=True)
 

@@ -106,14 +106,14 @@ class Campaign:
 
     def worker(self, queue: Queue, identity: str) -> subprocess.Popen[str]:
         """A worker in a process of its own that nobody watches."""
-        request = {
-            "directory": str(queue.directory),
-            "identity": identity,
-            "settings": {"stale_after": 3.0, "attempts": 50, "shard": None},
-        }
+        settings = {"stale_after": 3.0, "attempts": 50}
         quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "text": True}
-        command = [sys.executable, "-P", "-m", "cpdeform.sweep.engines.local", json.dumps(request)]
-        return subprocess.Popen(command, cwd=self.directory, env=self.environment, **quiet)
+        command = [sys.executable, "-P", "-m", "cpdeform.sweep.engines.local"]
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, cwd=self.directory, env=self.environment, **quiet)
+        assert process.stdin is not None
+        with process.stdin:
+            json.dump({"directory": str(queue.directory), "identity": identity, "settings": settings}, process.stdin)
+        return process
 
 
 def digests(queue: Queue) -> dict[str, str]:

@@ -73,8 +73,8 @@ def _start(queue: Queue, settings: WorkSettings, events: SimpleQueue[Event]) -> 
     threads = {} if queue.head.threads is None else thread_environment(queue.head.threads)
     try:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "cpdeform.sweep.engines.local", json.dumps(request)],
-            stdin=subprocess.DEVNULL,
+            [sys.executable, "-P", "-m", "cpdeform.sweep.engines.local"],
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
             errors="replace",
@@ -82,6 +82,10 @@ def _start(queue: Queue, settings: WorkSettings, events: SimpleQueue[Event]) -> 
         )
     except OSError as error:
         raise EngineError(f"cannot start a worker: {error.strerror or error}.") from error
+    if process.stdin is not None:
+        # A child that is gone already is found so by whoever listens to it.
+        with contextlib.suppress(OSError), process.stdin:
+            json.dump(request, process.stdin)
     child = _Child(identity, process)
     threading.Thread(goal=_listen, args=(child, events), daemon=True).start()
     return child
@@ -130,14 +134,12 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def main() -> None:
-    """Work as the request on the command line says; each job that is over is a line of JSON on stdout."""
+    """Work as the request on stdin says; each job that is over is a line of JSON on stdout."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     signal.signal(signal.SIGTERM, _interrupt)
-    request = json.loads(sys.argv[1])
-    given = request["settings"]
-    shard = None if given["shard"] is None else tuple(given["shard"])
-    settings = WorkSettings(**{**given, "shard": shard})
+    request = json.load(sys.stdin)
+    settings = WorkSettings.from_json(request["settings"])
     with answers, contextlib.suppress(KeyboardInterrupt):
         for outcome in Worker(Queue(Path(request["directory"])), settings, identity=request["identity"], own_process=True).work():
             answers.write(json.dumps(dataclasses.asdict(outcome)) + "\n")

@@ -79,7 +79,10 @@ class _Driver:
     def __init__(self, queue: Queue, settings: WorkSettings, engine: EngineRay) -> None:
         self._queue, self._settings = queue, settings
         self._task = ray.remote(_do).options(**engine.resources(queue, settings))
-        self._request = {"directory": str(queue.directory.resolve()), "settings": dataclasses.asdict(settings)}
+        self._request = {
+            "directory": str(queue.directory.resolve()),
+            "settings": dataclasses.asdict(dataclasses.replace(settings, shard=None, only=None)),
+        }
         self._most = engine.workers or AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)) // (queue.head.threads or 1))
         self._names = settings.own(queue.names())
         self._tasks: dict[Any, str] = {}
@@ -134,8 +137,7 @@ class _Driver:
 def _do(request: dict[str, Any], name: str) -> dict[str, Any] | None:
     """Do a job, within a task; None where somebody else has it."""
     queue = Queue(Path(request["directory"]))
-    given = request["settings"]
-    settings = WorkSettings(**{**given, "shard": None})
+    settings = WorkSettings.from_json(request["settings"])
     # A task that Ray begins anew, after its node died, bears the same number: its claim is still its own.
     identity = f"ray-{ray.get_runtime_context().get_task_id()}"
     claim = take(queue, name, worker=identity)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,6 +19,9 @@ from cpdeform.sweep.worker import Outcome, Worker, WorkSettings
 
 LOOK_EVERY = 2.0
 """Seconds between looks at the queue."""
+
+SECONDS_TO_END = 60.0
+"""How long workers may take to see that the sweep is over."""
 
 LOGS = "slurm"
 """Directory of submitit's files, in that of the queue."""
@@ -110,15 +112,17 @@ class EngineSlurm(Engine):
                 if ended and not found:
                     raise EngineError(_why(self.jobs, queue))
                 time.sleep(0.0 if found else LOOK_EVERY)
-        finally:
+        except BaseException:
             for job in self.jobs:
                 with contextlib.suppress(Exception):
                     job.cancel(check=False)
+            raise
+        _wait(self.jobs)
 
     def _submit(self, queue: Queue, settings: WorkSettings) -> list[submitit.Job[int]]:
         threads = queue.head.threads or 1
         timeouts = {f"{self.cluster}_max_num_timeout": MOST_TIMEOUTS}
-        worker = SlurmWorker(str(queue.directory.resolve()), dataclasses.replace(settings, shard=settings.shard))
+        worker = SlurmWorker(str(queue.directory.resolve()), settings)
         try:
             executor = submitit.AutoExecutor(folder=queue.directory / QUEUE / LOGS, cluster=self.cluster, **timeouts)
             executor.update_parameters(name="cpdeform", cpus_per_task=threads, **self.parameters)
@@ -127,6 +131,13 @@ class EngineSlurm(Engine):
                 return [executor.submit(worker) for _ in range(self.workers or 1)]
         except (RuntimeError, NameError, AssertionError, submitit.core.utils.FailedJobError) as error:
             raise EngineError(f"cannot submit to {self.cluster}: {str(error).splitlines()[0]}") from error
+
+
+def _wait(jobs: list[submitit.Job[int]]) -> None:
+    """Wait for workers that have nothing left to do."""
+    limit = time.monotonic() + SECONDS_TO_END
+    while not all(job.done() for job in jobs) and time.monotonic() < limit:
+        time.sleep(LOOK_EVERY / 10.0)
 
 
 def _over(queue: Queue, names: set[str]) -> set[str]:
