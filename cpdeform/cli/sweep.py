@@ -132,9 +132,10 @@ def throughput_text(found: Throughput) -> str:
     if rate is None:
         return "No job is done yet."
     hours = found.hours_for(ESTIMATE_PLANS, cores=1) or 0.0
+    needed = f"{hours:.3g} core-hours, {hours / ESTIMATE_CORES:.2g} hours on {ESTIMATE_CORES} cores"
     return (
-        f"{found.plans} plans in {found.core_hours:.3g} core-hours: {rate:.3g} plans per core-hour. At this rate {ESTIMATE_PLANS:,} "
-        f"plans take {hours:.3g} core-hours, {hours / ESTIMATE_CORES:.2g} hours on {ESTIMATE_CORES} cores."
+        f"{found.plans} plans in {found.core_hours:.3g} core-hours: {rate:.3g} plans per core-hour. "
+        f"At this rate {ESTIMATE_PLANS:,} plans take {needed}."
     )
 
 

@@ -27,9 +27,7 @@ def new_command(
     ] = None,
     iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: by the task]")] = None,
     stages: Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")] = None,
-    backend: Annotated[
-        str | None, typer.Option(help="Simulator.  [default: the fastest that is installed]", metavar="NAME")
-    ] = None,
+    backend: Annotated[str | None, typer.Option(help="Simulator.  [default: the fastest installed]", metavar="NAME")] = None,
     ot: Annotated[str | None, typer.Option(help="Optimal-transport solver.  [default: the fastest]", metavar="NAME")] = None,
     threads: Annotated[int, typer.Option(help="Threads of each job.")] = 1,
 ) -> None:

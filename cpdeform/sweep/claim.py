@@ -1,7 +1,7 @@
 """Claims: who does which job, and what becomes of the jobs of workers that died.
 
-A claim spares work, no more: were two workers ever to do the same job, both would make the same of it, and the rename by which a job
-is finished keeps one. So nothing here needs locks, which shared file systems keep badly.
+A claim spares work, no more: were two workers ever to do the same job, both would make the same of it, and the rename by which a
+job is finished keeps one. So nothing here needs locks, which shared file systems keep badly.
 """
 
 from __future__ import annotations

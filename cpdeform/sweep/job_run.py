@@ -21,6 +21,10 @@ FIGURES = ("status", "loss_initial", "loss_final", "metric", "metric_initial", "
 """Fields of a record that count as the figures of a job, beside the number of finished stages."""
 
 
+BROKEN_OFF = ("running", "interrupted", "failed")
+"""Statuses of records of runs that did not come to their end."""
+
+
 def do_run(context: JobContext) -> dict[str, Any]:
     """Run what a job asks for, fields of `RunConfiguration`; or go on with it where an attempt broke off.
 
@@ -47,13 +51,20 @@ def record_run(resolved: ResolvedRun, directory: Path, observers: Sequence[Obser
     from cpdeform.run.record_continued import RunContinuer
     from cpdeform.run.resolve import resolve
 
+    if _is_over(directory, resolved):
+        return
     earlier = _earlier(directory, resolved)
     if earlier is None:
         with RunRecorder(directory, configuration=resolved.configuration, overwrite=True) as recorder:
             resolved.run([recorder, *observers])
-    elif earlier.status in ("running", "interrupted", "failed"):
+    else:
         with RunContinuer(earlier) as recorder:
             resolve({}, registry=resolved.registry, record=earlier).run([recorder, *observers])
+
+
+def can_go_on(directory: Path, resolved: ResolvedRun) -> bool:
+    """Whether a directory holds finished stages of a run that broke off, the same as the one given."""
+    return not _is_over(directory, resolved) and _earlier(directory, resolved) is not None
 
 
 def figures(directory: Path) -> dict[str, Any]:
@@ -67,10 +78,22 @@ def figures(directory: Path) -> dict[str, Any]:
 def _earlier(directory: Path, resolved: ResolvedRun) -> RunRecord | None:
     """What an attempt at the same run has left, if it can be gone on from."""
     from cpdeform.run.record_continued import broken_off
-    from cpdeform.run.resume import recorded_configuration
+    from cpdeform.run.same_run import same_run
 
     with contextlib.suppress(InputError):
         record = broken_off(directory)
-        if record is not None and recorded_configuration(record) == resolved.configuration:
+        if record is not None and same_run(record, resolved.configuration, resolved.task):
             return record
     return None
+
+
+def _is_over(directory: Path, resolved: ResolvedRun) -> bool:
+    """Whether an attempt at the same run came to the run's end, and no further."""
+    from cpdeform.run.record_reader import load_record
+    from cpdeform.run.same_run import same_run
+
+    with contextlib.suppress(InputError):
+        record = load_record(directory)
+        over = record.status not in BROKEN_OFF and bool(record.stages)
+        return over and same_run(record, resolved.configuration, resolved.task)
+    return False

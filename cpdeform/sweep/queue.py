@@ -70,7 +70,7 @@ class Queue:
 
     @classmethod
     def create(cls, directory: Path | str, head: SweepHead, jobs: Iterable[Job], *, replace: bool = False) -> Queue:
-        """Make a sweep, or complete one that was left half made; a sweep that is there already with the same jobs is taken as it is.
+        """Make a sweep, or complete one that was left half made; one that is there with the same jobs is taken as it is.
 
         Args:
             directory: Where; made if missing.
@@ -130,12 +130,12 @@ class Queue:
         """
         path = self.file(JOBS, name)
         content = read_json(path, argument=f"job {path}")
-        if not isinstance(content, dict) or not isinstance(content.get("request"), dict):
+        known = isinstance(content, dict) and content.get("format") == FORMAT
+        if not known or not isinstance(content.get("kind"), str) or not isinstance(content.get("asked"), dict):
             raise InputError(f"job {path}", came="something else", expected="the content of a job")
         after = content.get("after")
-        return Job(
-            name=name, record=str(content.get("record")), request=content["request"], after=None if after is None else str(after)
-        )
+        after = None if after is None else str(after)
+        return Job(name=name, record=str(content.get("record")), request=content["request"], after=after)
 
     def outcomes(self, names: Collection[str] | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
         """What came of the jobs that are over, in the order of their names; a damaged file is told as the reason.
@@ -165,19 +165,19 @@ class Queue:
             remedy = "Make one with `cpdeform sweep new`."
             raise InputError(f"sweep {self.directory}", came=f"no {SWEEP_FILE}", expected="the directory of a sweep", remedy=remedy)
         content = read_json(path, argument=str(path))
-        known = isinstance(content, dict) and isinstance(content.get("kind"), str)
-        if not known or content.get("format") != FORMAT or not isinstance(content.get("asked"), dict):
+        if (
+            not isinstance(content, dict)
+            or not isinstance(content.get("kind"), str)
+            or content.get("format") != FORMAT
+            or not isinstance(content.get("asked"), dict)
+        ):
             raise InputError(str(path), came="something else, or a later version", expected=f"a sweep of format {FORMAT}")
         threads = content.get("threads")
         if threads is not None and not (isinstance(threads, int) and threads >= 1):
             raise InputError(f"{path}: threads", came=str(threads), expected="a whole number of at least 1")
         environment = content.get("environment")
-        return SweepHead(
-            kind=content["kind"],
-            threads=threads,
-            asked=content["asked"],
-            environment=environment if isinstance(environment, dict) else {},
-        )
+        known = environment if isinstance(environment, dict) else {}
+        return SweepHead(kind=content["kind"], threads=threads, asked=content["asked"], environment=known)
 
 
 def write_whole(path: Path, content: Mapping[str, Any]) -> None:

@@ -23,6 +23,7 @@ from cpdeform.core.plugins import load_registry
 from cpdeform.sweep.claim import STALE_AFTER, Claim, deaths, heartbeat, lose, silent, take
 from cpdeform.sweep.job import Job, JobContext, JobFunction
 from cpdeform.sweep.queue import ATTEMPTS, CLAIMS, DONE, FAILED, Queue, write_whole
+from cpdeform.sweep.settle import settle
 
 if TYPE_CHECKING:
     from cpdeform.planning.result import Observer
@@ -75,7 +76,8 @@ class WorkSettings:
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> WorkSettings:
         """Settings as `dataclasses.asdict` gives them, after a way through JSON."""
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in content.items()})
+        values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in content.items()}
+        return cls(**values)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -183,7 +185,7 @@ class Worker:
             "finished_at": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         }
         if job is not None:
-            settle(claim, job)
+            settle(claim.attempt, self.queue.directory / job.record)
         write_whole(self.queue.file(outcome, claim.name), figures)
         if self._own_process:
             keep_what_is_loaded()
@@ -233,26 +235,6 @@ def return_lost(queue: Queue, settings: WorkSettings, *, worker: str | None = No
             reason = f"{count[name]} workers died on it (out of memory, or killed)"
             write_whole(queue.file(FAILED, name), {"reason": reason, "seconds": 0.0})
     return found
-
-
-def settle(claim: Claim, job: Job) -> None:
-    """Put what came of a job where it belongs, in place of an earlier record; nothing, if nothing came of it."""
-    from cpdeform.run.record_files import own_files
-
-    place, attempt = claim.queue.directory / job.record, claim.attempt
-    if not attempt.is_dir() or not any(attempt.iterdir()):
-        shutil.rmtree(attempt, ignore_errors=True)
-        return
-    place.parent.mkdir(parents=True, exist_ok=True)
-    old = claim.queue.place(ATTEMPTS) / f".old-{os.urandom(6).hex()}"
-    with contextlib.suppress(FileNotFoundError):
-        place.rename(old)
-        for path in set(old.iterdir()) - set(own_files(old)):
-            # What somebody else has put there is not ours to remove.
-            if not (attempt / path.name).exists():
-                path.rename(attempt / path.name)
-    attempt.rename(place)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def limit_threads(threads: int) -> None:

@@ -57,10 +57,10 @@ def ray_with_a_killed_node(campaign: Campaign, ray_cluster: Any) -> None:
     from cpdeform.sweep.engines.ray import EngineRay
 
     cluster, nodes = ray_cluster
-    expected, queue, done = campaign.undisturbed(), campaign.new("ray"), 0
-    for outcome in EngineRay(address=cluster.address, memory_gb=0.1).work(queue, SETTINGS):
+    expected, queue = campaign.undisturbed(), campaign.new("ray")
+    outcomes = EngineRay(address=cluster.address, memory_gb=0.1).work(queue, SETTINGS)
+    for done, outcome in enumerate(outcomes, start=1):
         assert outcome.outcome == "done", outcome
-        done += 1
         if done == campaign.jobs // 2:
             cluster.remove_node(nodes[0], allow_graceful=False)
     check_all_done(queue, campaign)

@@ -19,7 +19,6 @@ def check(campaign: Campaign, *, workers: int, every: float, most: int = 10**6) 
     assert queue.listed(DONE) == set(queue.names())
     assert {path.name for path in (queue.directory / "records").iterdir()} == set(queue.names())
     assert digests(queue) == expected
-    print(f"{campaign.jobs} jobs, {workers} workers, {killed} killed, {status.lost} of them at work")
 
 
 def test_a_few_jobs(tmp_path, monkeypatch):

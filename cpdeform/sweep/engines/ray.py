@@ -79,10 +79,8 @@ class _Driver:
     def __init__(self, queue: Queue, settings: WorkSettings, engine: EngineRay) -> None:
         self._queue, self._settings = queue, settings
         self._task = ray.remote(_do).options(**engine.resources(queue, settings))
-        self._request = {
-            "directory": str(queue.directory.resolve()),
-            "settings": dataclasses.asdict(dataclasses.replace(settings, shard=None, only=None)),
-        }
+        plain = dataclasses.asdict(dataclasses.replace(settings, shard=None, only=None))
+        self._request = {"directory": str(queue.directory.resolve()), "settings": plain}
         self._most = engine.workers or AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)) // (queue.head.threads or 1))
         self._names = settings.own(queue.names())
         self._tasks: dict[Any, str] = {}
@@ -150,9 +148,8 @@ def _do(request: dict[str, Any], name: str) -> dict[str, Any] | None:
 def _connect(address: str | None) -> None:
     try:
         with contextlib.redirect_stdout(None):
-            ray.init(
-                address=address, log_to_driver=False, logging_level="warning", include_dashboard=False if address is None else None
-            )
+            own = {"include_dashboard": False} if address is None else {}
+            ray.init(address=address, log_to_driver=False, logging_level="warning", **own)
     except (ConnectionError, ValueError, RuntimeError) as error:
         came = "none that answers" if address is None else f"{address}, which does not answer"
         raise InputError("--address", came=came, expected=f"the address of a Ray cluster ({str(error).splitlines()[0]})") from error
