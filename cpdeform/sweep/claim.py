@@ -174,7 +174,7 @@ def heartbeat(claim: Claim, *, stale_after: float) -> Iterator[None]:
         while not over.wait(stale_after / BEATS):
             claim.beat()
 
-    thread = threading.Thread(goal=beat, name=f"heartbeat of {claim.name}", daemon=True)
+    thread = threading.Thread(target=beat, name=f"heartbeat of {claim.name}", daemon=True)
     thread.start()
     try:
         yield

@@ -130,8 +130,7 @@ class Queue:
         """
         path = self.file(JOBS, name)
         content = read_json(path, argument=f"job {path}")
-        known = isinstance(content, dict) and content.get("format") == FORMAT
-        if not known or not isinstance(content.get("kind"), str) or not isinstance(content.get("asked"), dict):
+        if not isinstance(content, dict) or not isinstance(content.get("request"), dict):
             raise InputError(f"job {path}", came="something else", expected="the content of a job")
         after = content.get("after")
         after = None if after is None else str(after)
@@ -165,19 +164,19 @@ class Queue:
             remedy = "Make one with `cpdeform sweep new`."
             raise InputError(f"sweep {self.directory}", came=f"no {SWEEP_FILE}", expected="the directory of a sweep", remedy=remedy)
         content = read_json(path, argument=str(path))
-        if (
-            not isinstance(content, dict)
-            or not isinstance(content.get("kind"), str)
-            or content.get("format") != FORMAT
-            or not isinstance(content.get("asked"), dict)
-        ):
+        known = isinstance(content, dict) and content.get("format") == FORMAT
+        if not known or not isinstance(content.get("kind"), str) or not isinstance(content.get("asked"), dict):
             raise InputError(str(path), came="something else, or a later version", expected=f"a sweep of format {FORMAT}")
         threads = content.get("threads")
         if threads is not None and not (isinstance(threads, int) and threads >= 1):
             raise InputError(f"{path}: threads", came=str(threads), expected="a whole number of at least 1")
         environment = content.get("environment")
-        known = environment if isinstance(environment, dict) else {}
-        return SweepHead(kind=content["kind"], threads=threads, asked=content["asked"], environment=known)
+        return SweepHead(
+            kind=content["kind"],
+            threads=threads,
+            asked=content["asked"],
+            environment=environment if isinstance(environment, dict) else {},
+        )
 
 
 def write_whole(path: Path, content: Mapping[str, Any]) -> None:

@@ -87,7 +87,7 @@ def _start(queue: Queue, settings: WorkSettings, events: SimpleQueue[Event]) -> 
         with contextlib.suppress(OSError), process.stdin:
             json.dump(request, process.stdin)
     child = _Child(identity, process)
-    threading.Thread(goal=_listen, args=(child, events), daemon=True).start()
+    threading.Thread(target=_listen, args=(child, events), daemon=True).start()
     return child
 
 
