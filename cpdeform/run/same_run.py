@@ -30,7 +30,7 @@ def same_run(record: RunRecord, configuration: RunConfiguration, task: Task) -> 
 
 
 def _same_configuration(record: RunRecord, configuration: RunConfiguration) -> bool:
-    apart = {"task", "goal", "stages"}
+    apart = {"task", "goal", "stages", "workers"}
     recorded = recorded_configuration(record).model_dump(mode="json", exclude=apart)
     return recorded == configuration.model_dump(mode="json", exclude=apart)
 
