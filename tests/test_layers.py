@@ -16,6 +16,7 @@ LAYERS = (
     ("run",),
     ("testing", "report", "sweep"),
     ("experiments", "tasks"),
+    ("datasets",),
     ("cli",),
 )
 """Packages from the lowest layer to the highest; one may import from itself and from the layers below its own."""

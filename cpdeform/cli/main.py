@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 from cpdeform import __version__
 from cpdeform.cli.bench import bench
 from cpdeform.cli.check import check
+from cpdeform.cli.dataset import dataset
 from cpdeform.cli.evaluate import evaluate
 from cpdeform.cli.experiment import experiment
 from cpdeform.cli.interruption import exit_code, interruptible
@@ -76,6 +77,7 @@ app.command()(experiment)
 app.command()(plugins)
 app.add_typer(task, name="task")
 app.add_typer(sweep, name="sweep")
+app.add_typer(dataset, name="dataset")
 app.add_typer(bench, name="bench")
 app.add_typer(check, name="check")
 

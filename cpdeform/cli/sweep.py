@@ -65,7 +65,7 @@ def work_command(
     options: dict[str, Any] = {**split_options(settings or []), "workers": workers}
     if address is not None:
         options["address"] = address
-    _work(queue, load_registry().create("engine", engine, **options), how)
+    work_on(queue, load_registry().create("engine", engine, **options), how)
     _report(queue, as_json=as_json)
 
 
@@ -139,7 +139,7 @@ def throughput_text(found: Throughput) -> str:
     )
 
 
-def _work(queue: Queue, engine: Engine, settings: WorkSettings) -> None:
+def work_on(queue: Queue, engine: Engine, settings: WorkSettings) -> None:
     """Let an engine work, a line on stderr for each job."""
     from cpdeform.sweep.status import sweep_status
 

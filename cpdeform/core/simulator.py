@@ -215,7 +215,7 @@ class Simulator(Portable, abc.ABC):
             Bytes; within a fifth of what is measured while the bodies stay about as large as they are at the start.
         """
 
-    def release_memory(self) -> None:  # noqa: B027 - most backends keep nothing
+    def release_memory(self) -> None:
         """Give back to the system what is kept between rollouts to be used again; trajectories stay usable."""
 
 

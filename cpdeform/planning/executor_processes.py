@@ -28,8 +28,8 @@ TRIES = 3
 class ExecutorProcesses:
     """Computes items in processes, each with threads of its own; a context manager, at whose end they end.
 
-    Simulators and objectives are sent to each process once and kept there. Processes that die are replaced, and their items computed
-    again. A single item is computed in this process.
+    Simulators and objectives are sent to each process once and kept there. Processes that die are replaced, and their items
+    computed again. A single item is computed in this process.
 
     Args:
         workers: Number of processes.
