@@ -134,7 +134,8 @@ def throughput_text(found: Throughput) -> str:
     hours = found.hours_for(ESTIMATE_PLANS, cores=1) or 0.0
     needed = f"{hours:.3g} core-hours, {hours / ESTIMATE_CORES:.2g} hours on {ESTIMATE_CORES} cores"
     return (
-        f"{found.plans} plans in {found.core_hours:.3g} core-hours: {rate:.3g} plans per core-hour. "
+        f"{found.plans} plans in {found.core_hours:.3g} core-hours ({found.cpu_hours:.3g} of them computing): "
+        f"{rate:.3g} plans per core-hour. "
         f"At this rate {ESTIMATE_PLANS:,} plans take {needed}."
     )
 

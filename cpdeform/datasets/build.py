@@ -102,7 +102,7 @@ class _Minari:
         except ImportError:
             return
         if self._writer is None:
-            fields = {"description": f"Plans of cpdeform for generated goals of {self._settings.scene}", "data_format": "hdf5"}
+            fields = {"description": f"Plans of cpdeform for generated goals of {self._settings.scene}"}
             identity = f"cpdeform/{self._name}-v0"
             self._writer = MinariWriter(self._directory, name=identity, sample=shard[0][1], fields=fields)
             self.made = True

@@ -69,7 +69,6 @@ def card_text(
     kinds = Counter(item["reset_kwargs"]["options"]["goal_kind"] for item in episodes)
     counts = [body["particle_count"] for body in environment["task"]["scene"]["bodies"]]
     versions = ", ".join(f"{package} {version}" for package, version in (environment["versions"] or {}).items() if version)
-    rate = took.plans_per_core_hour
     return TEXT.format(
         name=name,
         licence=settings.licence,
@@ -94,9 +93,17 @@ def card_text(
         seed=settings.seed,
         threads=settings.threads,
         versions=versions,
-        throughput="" if rate is None else f"The plans took {took.core_hours:.3g} core-hours: {rate:.3g} plans per core-hour.",
+        throughput=""
+        if rate is None
+        else f"The plans took {took.core_hours:.3g} core-hours ({took.cpu_hours:.3g} computing): {rate:.3g} plans per core-hour.",
         without=_without(built.without_plan),
     )
+
+
+def _took(took: Throughput) -> str:
+    rate = took.plans_per_core_hour
+    hours = f"{took.core_hours:.3g} core-hours ({took.cpu_hours:.3g} of them computing)"
+    return "" if rate is None else f"The plans took {hours}: {rate:.3g} plans per core-hour."
 
 
 def _figures(episodes: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:

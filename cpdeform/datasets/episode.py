@@ -81,8 +81,7 @@ def record_episode(record: RunRecord, *, particles: int, success_iou: float) -> 
     """
     stages = [stage for stage in record.stages if stage.status.executed]
     if not stages:
-        came = f"a run that found no plan ({record.status})"
-        raise InputError(f"run record {record.directory}", came=came, expected="a plan", remedy=str(record.run.get("advice", "")))
+        raise InputError("run", came=f"one without a plan ({record.status})", expected="at least one stage with a plan")
     observed = _observed(stages[0].state.particle_count, particles)
     actions, poses, positions = (_joined(stages, name) for name in ("actions", "tool_poses", "positions"))
     lengths = [len(_plan(stage, "actions")) for stage in stages]

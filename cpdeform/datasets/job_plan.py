@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cpdeform.core.plugins import Registry, load_registry
-from cpdeform.core.task import load_task, merge
+from cpdeform.core.task import changed_task, load_task, merge
 from cpdeform.datasets.settings import DatasetSettings
 from cpdeform.sweep.job import Job, JobContext
 from cpdeform.sweep.job_run import figures, record_run
@@ -56,7 +56,8 @@ def do_plan(context: JobContext) -> dict[str, Any]:
 
     values, registry = dict(context.job.request["run"]), load_registry()
     # The goal of a seed is the same however often it is made.
-    goal = generate_goal(load_task(values["task"], registry=registry), seed=context.job.request["goal"], registry=registry)
+    task = changed_task(load_task(values["task"], registry=registry), scene=values.get("scene", {}))
+    goal = generate_goal(task, seed=context.job.request["goal"], registry=registry)
     goal.write(context.directory / GOAL_FILE)
     resolved = resolve({**values, "goal": str(context.directory / GOAL_FILE)}, registry=registry)
     record_run(resolved, context.directory, context.observers)
