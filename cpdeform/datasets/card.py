@@ -93,9 +93,7 @@ def card_text(
         seed=settings.seed,
         threads=settings.threads,
         versions=versions,
-        throughput=""
-        if rate is None
-        else f"The plans took {took.core_hours:.3g} core-hours ({took.cpu_hours:.3g} computing): {rate:.3g} plans per core-hour.",
+        throughput=_took(took),
         without=_without(built.without_plan),
     )
 

@@ -61,7 +61,7 @@ class Campaign:
     def undisturbed(self) -> dict[str, str]:
         """Digests of the records that one worker makes, in this process."""
         queue = self.new("undisturbed", delay=0.0)
-        assert {outcome.outcome for outcome in Worker(queue).work()} == {"done"}
+        assert {outcome.outcome for outcome in Worker(queue, own_process=True).work()} == {"done"}
         return digests(queue)
 
     def with_kills(self, name: str, *, workers: int, every: float, most: int = 10**6, seed: int = 0) -> tuple[Queue, int]:
