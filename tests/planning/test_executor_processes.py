@@ -37,7 +37,8 @@ def test_a_run_over_processes_is_the_same_run():
     assert len(first.candidates) > 2
     assert [candidate.loss for candidate in first.candidates] == [candidate.loss for candidate in second.candidates]
     assert torch.equal(first.state.position, second.state.position)
-    assert not psutil.Process().children()
+    # What the standard library starts to look after shared memory stays.
+    assert not [child for child in psutil.Process().children() if "resource_tracker" not in " ".join(child.cmdline())]
 
 
 def test_processes_that_die_are_replaced(tmp_path):
