@@ -11,7 +11,7 @@ OUT ?= runs/first
 
 SANITIZED := plugins/cpdeform-native/build/sanitized
 
-.PHONY: run test quick faults lint goals sanitize clean
+.PHONY: run test quick faults sweeps lint goals sanitize clean
 
 run: $(NATIVE)
 	$(BIN)/cpdeform run writer --out $(OUT) --overwrite
@@ -29,6 +29,11 @@ quick: $(NATIVE)
 # 12,000 damaged files and options, killed and interrupted runs, full disks, some minutes; `make test` tries a part of them.
 faults: $(NATIVE)
 	$(BIN)/python -m pytest -m faults
+
+# 200 jobs with a worker killed every five seconds, through submitit, and (after `pip install "cpdeform[ray]"`) through Ray with a
+# node killed; some minutes on two free cores. `make test` does the same with a few jobs.
+sweeps: $(NATIVE)
+	$(BIN)/python -m pytest -m sweeps
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

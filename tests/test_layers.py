@@ -14,8 +14,9 @@ LAYERS = (
     ("core",),
     ("planning", "ot", "backends", "placement"),
     ("run",),
-    ("testing", "report"),
+    ("testing", "report", "sweep"),
     ("experiments", "tasks"),
+    ("datasets",),
     ("cli",),
 )
 """Packages from the lowest layer to the highest; one may import from itself and from the layers below its own."""

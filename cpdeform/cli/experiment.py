@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from cpdeform.experiments.experiment_plan import ExperimentSettings, PlannedRun
     from cpdeform.experiments.experiment_row import ExperimentRow
     from cpdeform.planning.result import Observer
+    from cpdeform.sweep.engine import Engine
 
 
 class ExperimentName(enum.StrEnum):
@@ -84,6 +85,13 @@ def experiment(
     no_run: Annotated[
         bool, typer.Option("--no-run", help="Run nothing; make the tables anew of all records in --out, or of those asked for.")
     ] = False,
+    workers: Annotated[
+        int | None,
+        typer.Option(help="Runs at the same time, each with its share of the cores.  [default: one, with all]", metavar="N"),
+    ] = None,
+    engine: Annotated[
+        str | None, typer.Option(help="Where they run: local, ray or slurm.  [default: this process]", metavar="NAME")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line.")] = False,
 ) -> None:
     """Run one of the paper's experiments, with a record of each run and a table of all.
@@ -104,11 +112,12 @@ def _command(name: str, given: dict[str, Any]) -> None:
     from cpdeform.experiments.experiment_tables import write_tables
 
     as_json, no_run, resume = (given.pop(key) for key in ("as_json", "no_run", "resume"))
+    where = {key: given.pop(key) for key in ("engine", "workers")}
     given["out"] = given["out"] or Path("experiments") / name
     rows: list[ExperimentRow] = []
     with contextlib.redirect_stdout(sys.stderr):
         # Some backends greet on stdout when they are imported.
-        source, planned, settings = (_recorded if no_run else _run)(name, given, resume=resume)
+        source, planned, settings = _recorded(name, given) if no_run else _run(name, given, where, resume=resume)
         if no_run:
             rows.extend(source)
             write_tables(name, rows, given["out"], planned=planned)
@@ -132,7 +141,7 @@ def _collect(name: str, rows: list[ExperimentRow], source: Iterator[ExperimentRo
         raise typer.Exit(exit_code(error)) from error
 
 
-def _recorded(name: str, given: dict[str, Any], *, resume: bool) -> tuple[Iterator[ExperimentRow], int, dict[str, Any]]:
+def _recorded(name: str, given: dict[str, Any]) -> tuple[Iterator[ExperimentRow], int, dict[str, Any]]:
     """Rows of the records that are there."""
     from cpdeform.experiments.experiment import recorded_runs
     from cpdeform.experiments.experiment_row import read_row
@@ -148,8 +157,11 @@ def _recorded(name: str, given: dict[str, Any], *, resume: bool) -> tuple[Iterat
     return rows, len(runs), {"out": str(given["out"])}
 
 
-def _run(name: str, given: dict[str, Any], *, resume: bool) -> tuple[Iterator[ExperimentRow], int, dict[str, Any]]:
+def _run(
+    name: str, given: dict[str, Any], where: dict[str, Any], *, resume: bool
+) -> tuple[Iterator[ExperimentRow], int, dict[str, Any]]:
     """Rows of runs that are made, or read where they are recorded."""
+    from cpdeform.core.machine import machine_cores
     from cpdeform.core.plugins import load_registry
     from cpdeform.experiments.experiment import run_experiment
     from cpdeform.experiments.experiment_plan import planned_runs
@@ -161,9 +173,14 @@ def _run(name: str, given: dict[str, Any], *, resume: bool) -> tuple[Iterator[Ex
     check_directory(settings.out, overwrite=True)
     runs = planned_runs(settings, registry=registry)
     command = without_directories(shlex.join(_command_line(name, given)))
-    observe = _observer(settings, command, registry)
-    rows = run_experiment(settings, runs, registry=registry, resume=resume, observe=observe)
-    return rows, len(runs), dataclasses.asdict(settings)
+    session = _Session(settings, command, registry)
+    if where["engine"] is None and where["workers"] in (None, 1):
+        rows = run_experiment(settings, runs, resume=resume, observe=_observer(settings, session))
+        return rows, len(runs), dataclasses.asdict(settings)
+    engine: Engine = registry.create("engine", where["engine"] or "local", workers=where["workers"])
+    threads = max(1, machine_cores() // (where["workers"] or 1))
+    rows = run_experiment(settings, runs, resume=resume, engine=engine, threads=threads)
+    return session.noted(rows), len(runs), dataclasses.asdict(settings)
 
 
 def _settings(name: str, given: dict[str, Any], registry: Registry) -> ExperimentSettings:
@@ -196,29 +213,49 @@ def _command_line(name: str, given: dict[str, Any]) -> Iterator[str]:
             yield from (f"--{key.replace('_', '-')}", str(value))
 
 
-def _observer(
-    settings: ExperimentSettings, command: str, registry: Registry
-) -> Callable[[PlannedRun], contextlib.AbstractContextManager[Sequence[Observer]]]:
-    """Shows the progress of each run on stderr; with the first one, this session is noted in the directory."""
-    noted = False
+class _Session:
+    """This command, to be noted in the experiment's directory once it has run something."""
 
-    @contextlib.contextmanager
-    def observe(run: PlannedRun) -> Iterator[Sequence[Observer]]:
-        from cpdeform.cli.progress import ProgressBar, ProgressLines
+    def __init__(self, settings: ExperimentSettings, command: str, registry: Registry) -> None:
+        self._settings, self._command, self._registry = settings, command, registry
+        self._noted = False
+
+    def note(self) -> None:
+        """Note it, once."""
         from cpdeform.experiments.experiment_tables import note_session
         from cpdeform.experiments.tables import describe_machine, describe_versions
 
-        nonlocal noted
-        if not noted:
-            machine = describe_machine(device=settings.device or "cpu")
-            note_session(settings.out, command=command, machine=machine, versions=describe_versions(registry))
-            noted = True
-        typer.echo(f"{run.task}, {run.method}, seed {run.seed}", err=True)
+        if not self._noted:
+            machine = describe_machine(device=self._settings.device or "cpu")
+            note_session(self._settings.out, command=self._command, machine=machine, versions=describe_versions(self._registry))
+            self._noted = True
+
+    def noted(self, rows: Iterator[ExperimentRow]) -> Iterator[ExperimentRow]:
+        """Pass rows on; with the first one that was not found but made, this session is noted."""
+        for row in rows:
+            if not row.reused:
+                self.note()
+            yield row
+
+
+def _observer(
+    settings: ExperimentSettings, session: _Session
+) -> Callable[[PlannedRun], contextlib.AbstractContextManager[Sequence[Observer]]]:
+    """Shows the progress of each run on stderr, from when it starts."""
+
+    @contextlib.contextmanager
+    def observe(run: PlannedRun) -> Iterator[Sequence[Observer]]:
+        from cpdeform.cli.progress import ProgressBar, ProgressLines, Starting
+
+        def begin() -> None:
+            session.note()
+            typer.echo(f"{run.task}, {run.method}, seed {run.seed}", err=True)
+
         if sys.stderr.isatty():
             with ProgressBar(stages=settings.stages) as bar:
-                yield [bar]
+                yield [Starting(begin), bar]
         else:
-            yield [ProgressLines()]
+            yield [Starting(begin), ProgressLines()]
 
     return observe
 

@@ -12,12 +12,14 @@ from typer.core import TyperGroup
 from cpdeform import __version__
 from cpdeform.cli.bench import bench
 from cpdeform.cli.check import check
+from cpdeform.cli.dataset import dataset
 from cpdeform.cli.evaluate import evaluate
 from cpdeform.cli.experiment import experiment
 from cpdeform.cli.interruption import exit_code, interruptible
 from cpdeform.cli.plugins import plugins
 from cpdeform.cli.run import run
 from cpdeform.cli.strategies import strategies
+from cpdeform.cli.sweep import sweep
 from cpdeform.cli.system_limits import system_limit
 from cpdeform.cli.task import task
 from cpdeform.cli.tasks import tasks
@@ -74,6 +76,8 @@ app.command()(strategies)
 app.command()(experiment)
 app.command()(plugins)
 app.add_typer(task, name="task")
+app.add_typer(sweep, name="sweep")
+app.add_typer(dataset, name="dataset")
 app.add_typer(bench, name="bench")
 app.add_typer(check, name="check")
 

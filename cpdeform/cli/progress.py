@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from types import TracebackType
 
 import typer
@@ -31,6 +32,21 @@ class Progress(Observer):
 
     def _print(self, line: str) -> None:
         typer.echo(line, file=sys.stderr)
+
+
+class Starting(Observer):
+    """Does something when a run starts.
+
+    Args:
+        begin: What to do.
+    """
+
+    def __init__(self, begin: Callable[[], None]) -> None:
+        self._begin = begin
+
+    def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
+        """Do it."""
+        self._begin()
 
 
 class ProgressBar(Progress):

@@ -30,6 +30,7 @@ FLAGS = {
     "stages": "--stages",
     "steps": "--steps",
     "goal": "--goal",
+    "workers": "--workers",
     "optimizer.iterations": "--iterations",
 }
 """Flag of each field of the configuration that has one, for messages."""
@@ -55,6 +56,9 @@ def run(
         Path | None, typer.Option(help="Goal file instead of the task's own, see `cpdeform task import-grid`.", metavar="FILE")
     ] = None,
     iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: by the task]")] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that the candidates of a stage are spread over.  [default: 1]", metavar="N")
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Any other option, e.g. optimizer.learning_rate=0.05; repeatable.", metavar="KEY=VALUE"),
@@ -80,7 +84,7 @@ def run(
     Exit code 0: a plan was found; 1: none was (the advice says what to try); 2: unusable input; 130, 143, 129: interrupted
     by control-C, SIGTERM, SIGHUP.
     """
-    flags = (task, backend, ot, placer, strategy, device, seed, stages, steps, goal, iterations)
+    flags = (task, backend, ot, placer, strategy, device, seed, stages, steps, goal, workers, iterations)
     given = {field: value for field, value in zip(FLAGS, flags, strict=True) if value is not None}
     resolved = resolve_command(given, settings or [], resume=resume, out=out)
     if dry_run:

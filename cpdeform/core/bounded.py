@@ -53,6 +53,7 @@ def _real(value: Any) -> Any:
 Whole = Annotated[int, BeforeValidator(_whole), Strict()]
 Real = Annotated[float, BeforeValidator(_real), Strict(), Field(allow_inf_nan=False)]
 Count = Annotated[Whole, Field(ge=1, le=MOST_COUNT)]
+Workers = Annotated[Whole, Field(ge=1, le=1000)]
 Seed = Annotated[Whole, Field(ge=0, le=MOST_SEED)]
 PositiveFloat = Annotated[Real, Field(ge=1e-12, le=1e15)]
 NonNegativeFloat = Annotated[Real, Field(ge=0.0, le=1e15)]

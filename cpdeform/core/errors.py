@@ -142,3 +142,7 @@ class RecordError(CpdeformError):
 
 class PluginError(CpdeformError):
     """A plugin that registers something inconsistent, e.g. a name twice."""
+
+
+class EngineError(CpdeformError):
+    """Workers of a sweep that cannot be started, or that end before they have done anything."""

@@ -58,6 +58,16 @@ def cpdeform_strategies() -> list[PluginSpec]:  # type: ignore[empty-body]
 
 
 @hookspec
+def cpdeform_jobs() -> list[PluginSpec]:  # type: ignore[empty-body]
+    """Register kinds of jobs of sweeps: functions of a `cpdeform.sweep.job.JobContext` that return a job's figures."""
+
+
+@hookspec
+def cpdeform_engines() -> list[PluginSpec]:  # type: ignore[empty-body]
+    """Register subclasses of `cpdeform.sweep.engine.Engine`, which run the workers of a sweep."""
+
+
+@hookspec
 def cpdeform_stage_finished(result: Any) -> None:
     """Observe a finished stage, a `cpdeform.planning.result.StageResult`."""
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.portable import Portable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +91,7 @@ LEAST_RELATIVE_BLUR = 1e-6
 precision hardly any digits below."""
 
 
-class OTSolver(abc.ABC):
+class OTSolver(Portable, abc.ABC):
     """Solves optimal transport between two weighted particle clouds."""
 
     capabilities: ClassVar[OTCapabilities]

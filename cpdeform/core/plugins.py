@@ -25,6 +25,8 @@ KINDS: Mapping[str, str] = {
     "placer": "cpdeform_placers",
     "strategy": "cpdeform_strategies",
     "task": "cpdeform_tasks",
+    "job": "cpdeform_jobs",
+    "engine": "cpdeform_engines",
 }
 """What can be registered, and the hook that registers it."""
 

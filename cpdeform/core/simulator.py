@@ -17,6 +17,7 @@ from cpdeform.core.errors import CapabilityError, InputError, brief
 from cpdeform.core.final_gradient import pull_back, state_tensors
 from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.options import whole_number
+from cpdeform.core.portable import Portable
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator_inputs import check_values
 from cpdeform.core.state import State, initial_state
@@ -85,7 +86,7 @@ class RolloutGradient:
     initial_state: State
 
 
-class Simulator(abc.ABC):
+class Simulator(Portable, abc.ABC):
     """A batch of worlds of elastoplastic clay and rigid tools.
 
     Args:
@@ -227,7 +228,7 @@ class Simulator(abc.ABC):
         """
         return type(self)(scene, batch_size=self.batch_size, device=self.device, dtype=self.dtype)
 
-    def release_memory(self) -> None:  # noqa: B027 - most backends keep nothing
+    def release_memory(self) -> None:
         """Give back to the system what is kept between rollouts to be used again; trajectories stay usable."""
 
 

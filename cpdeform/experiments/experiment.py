@@ -1,151 +1,111 @@
 """The paper's experiments: tasks, methods and seeds, a run record each, and a table of them all.
 
-Runs are made one after the other in this process, since a simulator uses every core. A record that is there already and belongs to
-the same task and configuration is read instead of made again, so that an experiment that was broken off goes on where it was.
+An experiment's directory is that of a sweep, too: its runs are jobs, which this process does one after the other, since a simulator
+uses every core, or the workers of an engine. A record that is there already and belongs to the same task and configuration is read
+instead of made again, so that an experiment that was broken off goes on where it was, and several commands may share one.
 """
 
 from __future__ import annotations
 
-import contextlib
-import math
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-import torch
-
-from cpdeform.core.errors import CpdeformError, InputError, RecordError
-from cpdeform.core.plugins import Registry
-from cpdeform.core.task import Task
-from cpdeform.experiments.experiment_plan import (
-    BASELINE,
-    METHODS,
-    REFERENCE,
-    TASKS,
-    ExperimentSettings,
-    PlannedRun,
-    configure,
-)
-from cpdeform.experiments.experiment_row import OVER, ExperimentRow, forget, forget_failure, note_failure, read_row
+from cpdeform.core.errors import InputError
+from cpdeform.experiments.experiment_job import do_experiment_run, experiment_jobs
+from cpdeform.experiments.experiment_plan import METHODS, TASKS, ExperimentSettings, PlannedRun
+from cpdeform.experiments.experiment_row import ExperimentRow, read_row
 from cpdeform.planning.result import Observer
-from cpdeform.run.configuration import RunConfiguration
-from cpdeform.run.record import RunRecorder
-from cpdeform.run.record_reader import RunRecord, load_record
-from cpdeform.run.resolve import ResolvedRun
-from cpdeform.run.resume import recorded_configuration
+from cpdeform.run.record_files import environment
+from cpdeform.sweep.claim import claimant
+from cpdeform.sweep.engine import Engine
+from cpdeform.sweep.job import Job
+from cpdeform.sweep.queue import CLAIMS, FAILED, SWEEP_FILE, Queue, SweepHead
+from cpdeform.sweep.worker import Outcome, Worker, WorkSettings, return_lost
 
 Observe = Callable[[PlannedRun], AbstractContextManager[Sequence[Observer]]]
 """Gives the observers of a run, for as long as it goes on."""
 
 RECORD_PATTERN = re.compile(rf"({'|'.join(METHODS)})-seed(\d+)")
-SAME_GOAL = 1e-6
-"""Largest difference between goals that count as the same, length units."""
 
 
 def run_experiment(
     settings: ExperimentSettings,
     runs: Sequence[PlannedRun],
     *,
-    registry: Registry,
     resume: bool = True,
     observe: Observe | None = None,
+    engine: Engine | None = None,
+    threads: int | None = None,
 ) -> Iterator[ExperimentRow]:
     """Make every run of an experiment, or read it where it was made before.
 
     Args:
         settings: What to run.
         runs: Runs of `planned_runs`, in their order.
-        registry: Where names are looked up.
         resume: Read finished records with the same task and configuration instead of running again.
-        observe: Gives observers of a run, beside its record.
+        observe: Gives observers of a run, beside its record; without an engine.
+        engine: Where to run; defaults to this process, one run after the other.
+        threads: Threads of each run; defaults to those that this process may use.
 
     Returns:
         A row for each run, as it is ready. A run that cannot be made is a row with the reason.
+
+    Raises:
+        InputError: Another command is at one of the runs, with other settings.
     """
-    references: dict[tuple[str, int], ExperimentRow] = {}
-    for run in runs:
-        iterations = None
-        if settings.equal_evaluations and run.method == BASELINE:
-            iterations = evaluations_per_stage(references.get((run.task, run.seed)))
-        row = _row(run, settings, registry, iterations, resume=resume, observe=observe or _unobserved)
-        if run.method == REFERENCE:
-            references[run.task, run.seed] = row
-        yield row
+    jobs = experiment_jobs(settings, runs, resume=resume)
+    queue = _queue(settings.out, [job for job, _ in jobs], threads=threads)
+    planned = {job.name: run for job, run in jobs}
+    work = WorkSettings(only=tuple(planned))
+    if engine is None:
+        watched = _watched(planned, observe) if observe else None
+        outcomes = Worker(queue, work, function=do_experiment_run, observe=watched).work()
+    else:
+        outcomes = engine.work(queue, work)
+    left = dict(planned)
+    for outcome in outcomes:
+        yield _row(left.pop(outcome.name), outcome, settings)
+    for name, run in left.items():
+        # Another command has done it meanwhile.
+        (content,) = (content for _, content in queue.outcomes([name]))
+        yield _row(run, Outcome(name=name, outcome=content.pop("outcome"), figures=content | {"reused": True}), settings)
 
 
-def evaluations_per_stage(row: ExperimentRow | None) -> int | None:
-    """Gradient evaluations that a run used per stage that it tried, rounded up; None where it made none."""
-    if row is None or not row.gradient_evaluations or not row.stages_tried:
-        return None
-    return math.ceil(row.gradient_evaluations / row.stages_tried)
+def _queue(out: Path, jobs: Sequence[Job], *, threads: int | None) -> Queue:
+    """The queue with these jobs to be done, whatever became of them before."""
+    if (out / SWEEP_FILE).exists():
+        there = Queue(out)
+        return_lost(there, WorkSettings())
+        for job in jobs:
+            busy = there.file(CLAIMS, job.name).exists() and claimant(there.file(CLAIMS, job.name)) is not None
+            if busy and there.job(job.name).content() != job.content():
+                raise InputError(
+                    "--out",
+                    came=f"{out}, where another command is at {job.record}",
+                    expected="the same options as that one's",
+                    remedy="Wait for it or stop it, or choose another directory.",
+                )
+    head = SweepHead(kind="experiment", threads=threads, environment=environment())
+    queue = Queue.create(out, head, jobs, replace=True)
+    for job in jobs:
+        if not queue.file(CLAIMS, job.name).exists():
+            queue.forget(job.name)
+    return queue
 
 
-def _row(
-    run: PlannedRun, settings: ExperimentSettings, registry: Registry, iterations: int | None, *, resume: bool, observe: Observe
-) -> ExperimentRow:
-    try:
-        resolved = configure(run, settings, registry=registry, iterations=iterations)
-        reused = resume and is_done(run.directory, resolved.configuration, resolved.task)
-        if reused:
-            forget_failure(run)
-        else:
-            _make(run, resolved, observe)
-    except Exception as error:
-        return note_failure(run, error)
+def _watched(planned: dict[str, PlannedRun], observe: Observe) -> Callable[[Job], AbstractContextManager[Sequence[Observer]]]:
+    return lambda job: observe(planned[job.name])
+
+
+def _row(run: PlannedRun, outcome: Outcome, settings: ExperimentSettings) -> ExperimentRow:
+    """The row of a run that is over."""
+    reason = outcome.figures.get("reason")
+    if outcome.outcome == FAILED and reason is not None:
+        return ExperimentRow(task=run.task, method=run.method, seed=run.seed, status="failed", reason=str(reason))
+    reused = bool(outcome.figures.get("reused"))
     return read_row(run, paper_metric=settings.paper_metric, shape=settings.shape, reused=reused)
-
-
-def _make(run: PlannedRun, resolved: ResolvedRun, observe: Observe) -> None:
-    """Run with a record, in place of what is there; a run that breaks off once it has begun says so in its record."""
-    recorder = RunRecorder(run.directory, configuration=resolved.configuration, overwrite=True)
-    forget(run)
-    try:
-        with recorder, observe(run) as observers:
-            resolved.run([recorder, *observers])
-    except RecordError:
-        raise
-    except Exception:
-        if not recorder.started:
-            raise
-
-
-@contextlib.contextmanager
-def _unobserved(run: PlannedRun) -> Iterator[Sequence[Observer]]:
-    yield ()
-
-
-def is_done(directory: Path, configuration: RunConfiguration, task: Task) -> bool:
-    """Whether a directory holds the record of a run that came to its end, of the same task with the same configuration.
-
-    Where files lie does not count, nor do versions: scene, goal and schedule are compared as they are in the record.
-
-    Args:
-        directory: Where the record would be.
-        configuration: That of the run to be made, names resolved.
-        task: The task with the configuration's changes.
-    """
-    try:
-        record = load_record(directory)
-        return record.status in OVER and _same_configuration(record, configuration) and _same_task(record, configuration, task)
-    except CpdeformError:
-        return False
-
-
-def _same_configuration(record: RunRecord, configuration: RunConfiguration) -> bool:
-    apart = {"task", "goal", "stages"}
-    recorded = recorded_configuration(record).model_dump(mode="json", exclude=apart)
-    return recorded == configuration.model_dump(mode="json", exclude=apart)
-
-
-def _same_task(record: RunRecord, configuration: RunConfiguration, task: Task) -> bool:
-    stages = recorded_configuration(record).stages or record.task.stage_count
-    if stages != (configuration.stages or task.stage_count) or record.run.get("resumed_from") is not None:
-        return False
-    if any(getattr(record.task, name) != getattr(task, name) for name in ("name", "scene", "step_count", "rest_steps", "metric")):
-        return False
-    goal = torch.as_tensor(task.load_goal()).to(record.goal)
-    return goal.shape == record.goal.shape and torch.allclose(goal, record.goal, rtol=0.0, atol=SAME_GOAL)
 
 
 def recorded_runs(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import time
 from collections.abc import Sequence
 
@@ -129,12 +130,12 @@ def evaluate_worlds(
     Returns:
         The evaluation of all worlds; wall times are sums over the batches.
     """
-    batches = []
-    for start in range(0, len(actions), evaluator.simulator.batch_size):
-        part = slice(start, start + evaluator.simulator.batch_size)
+    batches, size = [], min(evaluator.simulator.batch_size, math.ceil(len(actions) / executor.width))
+    for start in range(0, len(actions), size):
+        part = slice(start, start + size)
         entries = tuple(entry for entry in warm[part] if entry is not None)
         ready = entries if len(entries) == len(actions[part]) else None
-        worlds = state if len(actions) <= evaluator.simulator.batch_size else _part(state, part)
+        worlds = state if len(actions) <= size else _part(state, part)
         batches.append(Batch(worlds, actions[part], ready, stand_ins[part], measured and start == 0))
     found = executor.map(evaluator, batches)
     if len(found) == 1:

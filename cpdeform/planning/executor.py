@@ -10,7 +10,16 @@ Answer = TypeVar("Answer")
 
 
 class Executor(Protocol):
-    """Computes a function of independent items, in this process or elsewhere."""
+    """Computes a function of independent items, in this process or elsewhere.
+
+    Attributes:
+        width: How many items it computes at the same time; work is cut into at least as many, where there is that much.
+    """
+
+    @property
+    def width(self) -> int:
+        """How many items it computes at the same time."""
+        ...
 
     def map(self, function: Callable[[Item], Answer], items: Sequence[Item]) -> list[Answer]:
         """Answers in the order of the items.
@@ -25,6 +34,8 @@ class Executor(Protocol):
 
 class ExecutorSerial:
     """One item after the other in this process: a simulator uses every core already."""
+
+    width = 1
 
     def map(self, function: Callable[[Item], Answer], items: Sequence[Item]) -> list[Answer]:
         """Answers in the order of the items."""

@@ -177,8 +177,9 @@ class Workbench:
         losses = []
         evaluator = Evaluator(self.simulator, self.objective if objective is None else objective, with_gradient=False)
         # Piece by piece: the states of hundreds of worlds need not be there at once.
-        for start in range(0, len(candidates), self.simulator.batch_size):
-            part = candidates[start : start + self.simulator.batch_size]
+        size = self.simulator.batch_size * self.executor.width
+        for start in range(0, len(candidates), size):
+            part = candidates[start : start + size]
             state = self.worlds(part)
             found = evaluate_worlds(
                 evaluator,

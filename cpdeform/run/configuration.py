@@ -18,6 +18,7 @@ from cpdeform.core.bounded import (
     PositiveFloat,
     Seed,
     Whole,
+    Workers,
 )
 from cpdeform.core.errors import InputError
 from cpdeform.core.old_names import current_options
@@ -121,6 +122,8 @@ class RunConfiguration(FrozenModel):
         goal: File of the goal instead of the task's own, e.g. one written by `cpdeform task import-grid`.
         strategy: Registered name of the strategy: ``"cpdeform"``, or ``"paper"`` for Algorithm 1 to the letter. What it sets, the
             user overrides.
+        workers: Processes that batches of candidates are spread over; the threads of each are its share of the cores, unless
+            ``simulator_options.threads`` says otherwise.
         optimizer: Options of the optimiser.
         objective: Options of the loss.
         priorities: Options of the transport priorities.
@@ -143,6 +146,7 @@ class RunConfiguration(FrozenModel):
     rest_steps: Whole | None = Field(default=None, ge=0, le=MOST_STEPS)
     goal: Path | None = None
     strategy: str = DEFAULT_STRATEGY
+    workers: Workers = 1
     optimizer: OptimizerConfiguration = OptimizerConfiguration()
     objective: ObjectiveConfiguration = ObjectiveConfiguration()
     priorities: PrioritiesConfiguration = PrioritiesConfiguration()

@@ -6,12 +6,14 @@ run everywhere.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.forking import prepare_for_forks
+from cpdeform.core.machine import available_cores
 from cpdeform.core.objective import Objective
 from cpdeform.core.old_names import current_options
 from cpdeform.core.ot import OTSolver
@@ -21,6 +23,8 @@ from cpdeform.core.simulator import Simulator
 from cpdeform.core.state import State
 from cpdeform.core.task import Task, changed_task, limited_task, load_task, merge, validate
 from cpdeform.planning.algorithm import Planner
+from cpdeform.planning.executor import Executor, ExecutorSerial
+from cpdeform.planning.executor_processes import ExecutorProcesses
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.result import Observer, StageResult
 from cpdeform.planning.strategy import Parts, Strategy
@@ -103,11 +107,22 @@ class ResolvedRun:
         }
         return {kind: getattr(self.configuration, kind) if part is None else type(part).__name__ for kind, part in given.items()}
 
-    def planner(self, observers: Sequence[Observer] = ()) -> Planner:
+    def executor(self) -> ExecutorProcesses | None:
+        """Processes for the configuration's workers, to be closed after use; None for one worker, which is this process."""
+        workers = self.configuration.workers
+        return None if workers == 1 else ExecutorProcesses(workers, threads=self._threads())
+
+    def _threads(self) -> int:
+        """Threads of each worker, those of this process included: what comes of a run does not depend on who computes it."""
+        asked = self.configuration.simulator_options.get("threads")
+        return asked if isinstance(asked, int) else max(1, available_cores() // self.configuration.workers)
+
+    def planner(self, observers: Sequence[Observer] = (), *, executor: Executor | None = None) -> Planner:
         """Make the parts and put them together.
 
         Args:
             observers: Told of every iteration and stage, in order; the plugins' observers come after them.
+            executor: Where batches of worlds are computed; defaults to this process.
 
         Raises:
             InputError: An option does not fit.
@@ -125,7 +140,7 @@ class ResolvedRun:
             configuration.backend,
             scene=task.scene,
             device=configuration.device,
-            **{"batch_size": MAX_WORLDS, **configuration.simulator_options},
+            **{"batch_size": MAX_WORLDS, **self._share(), **configuration.simulator_options},
         )
         optimizer = objects.optimizer or make_optimizer(configuration.optimizer)
         problem = transport_problem(placer, configuration.priorities)
@@ -152,10 +167,16 @@ class ResolvedRun:
             objective=objective,
             phases=self.strategy.phases(parts),
             loop=self.strategy.loop,
+            executor=executor or ExecutorSerial(),
             seed=configuration.seed,
             observers=(*observers, HookObserver(registry.manager)),
             names=self.names,
         )
+
+    def _share(self) -> dict[str, int]:
+        """The simulator's threads where several processes share the cores."""
+        known = self.registry.option_names("simulator", self.configuration.backend)
+        return {"threads": self._threads()} if self.configuration.workers > 1 and known is not None and "threads" in known else {}
 
     def run(self, observers: Sequence[Observer] = ()) -> RunResult:
         """Run it; as `cpdeform.deform`.
@@ -163,9 +184,10 @@ class ResolvedRun:
         Args:
             observers: Told of every iteration and stage, in order; the plugins' observers come after them.
         """
-        found = self.planner(observers).run(
-            stages=self.configuration.stages, state=self.state, first_stage=self.first_stage, previous=self.previous
-        )
+        with self.executor() or contextlib.nullcontext() as executor:
+            found = self.planner(observers, executor=executor).run(
+                stages=self.configuration.stages, state=self.state, first_stage=self.first_stage, previous=self.previous
+            )
         fields = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
         return RunResult(**fields, configuration=self.configuration, resumed_from=self.record)
 

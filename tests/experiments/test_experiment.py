@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from cpdeform.cli.main import app
 from cpdeform.core.machine import available_cores
 from cpdeform.core.plugins import load_registry
-from cpdeform.experiments.experiment import evaluations_per_stage
+from cpdeform.experiments.experiment_job import evaluations_per_stage
 from cpdeform.experiments.experiment_plan import METHODS, TASKS, expand_tasks
 from cpdeform.experiments.experiment_row import ExperimentRow, without_directories
 from cpdeform.experiments.experiment_tables import csv_text, paper_figures, short_table, table_text

@@ -87,6 +87,8 @@ def test_descent_and_refinement_are_refused_alone(task):
 class ExecutorBackwards:
     """Computes the last item first, in other threads."""
 
+    width = 2
+
     def __init__(self):
         self.items = 0
 

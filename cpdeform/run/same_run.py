@@ -1,0 +1,45 @@
+"""Whether a record is that of a certain run."""
+
+from __future__ import annotations
+
+import torch
+
+from cpdeform.core.task import Task
+from cpdeform.run.configuration import RunConfiguration
+from cpdeform.run.record_reader import RunRecord
+from cpdeform.run.resume import recorded_configuration
+
+SAME_GOAL = 1e-6
+"""Largest difference between goals that count as the same, length units."""
+
+
+def same_run(record: RunRecord, configuration: RunConfiguration, task: Task) -> bool:
+    """Whether a record is that of a run from its start, of the same task with the same configuration.
+
+    Where files lie does not count, nor do versions: scene, goal and schedule are compared as they are in the record.
+
+    Args:
+        record: The record, of a run that is over or not.
+        configuration: That of the run, names resolved.
+        task: The task with the configuration's changes.
+
+    Raises:
+        InputError: The record is damaged, or the task's goal cannot be read.
+    """
+    return _same_configuration(record, configuration) and _same_task(record, configuration, task)
+
+
+def _same_configuration(record: RunRecord, configuration: RunConfiguration) -> bool:
+    apart = {"task", "goal", "stages", "workers"}
+    recorded = recorded_configuration(record).model_dump(mode="json", exclude=apart)
+    return recorded == configuration.model_dump(mode="json", exclude=apart)
+
+
+def _same_task(record: RunRecord, configuration: RunConfiguration, task: Task) -> bool:
+    stages = recorded_configuration(record).stages or record.task.stage_count
+    if stages != (configuration.stages or task.stage_count) or record.run.get("resumed_from") is not None:
+        return False
+    if any(getattr(record.task, name) != getattr(task, name) for name in ("name", "scene", "step_count", "rest_steps", "metric")):
+        return False
+    goal = torch.as_tensor(task.load_goal()).to(record.goal)
+    return goal.shape == record.goal.shape and torch.allclose(goal, record.goal, rtol=0.0, atol=SAME_GOAL)

@@ -1,0 +1,1 @@
+"""Sweeps: many jobs in a directory, done by any number of workers on any number of machines."""
