@@ -19,21 +19,6 @@ if TYPE_CHECKING:
     from cpdeform.run.record import RunRecorder
     from cpdeform.run.resolve import ResolvedRun
 
-FLAGS = {
-    "task": "TASK",
-    "backend": "--backend",
-    "ot": "--ot",
-    "placer": "--placer",
-    "strategy": "--strategy",
-    "device": "--device",
-    "seed": "--seed",
-    "stages": "--stages",
-    "steps": "--steps",
-    "goal": "--goal",
-    "optimizer.iterations": "--iterations",
-}
-"""Flag of each field of the configuration that has one, for messages."""
-
 SOURCE = "--set"
 
 
@@ -80,6 +65,8 @@ def run(
     Exit code 0: a plan was found; 1: none was (the advice says what to try); 2: unusable input; 130, 143, 129: interrupted
     by control-C, SIGTERM, SIGHUP.
     """
+    from cpdeform.run.command import FLAGS
+
     flags = (task, backend, ot, placer, strategy, device, seed, stages, steps, goal, iterations)
     given = {field: value for field, value in zip(FLAGS, flags, strict=True) if value is not None}
     resolved = resolve_command(given, settings or [], resume=resume, out=out)
@@ -115,6 +102,7 @@ def resolve_command(
     from cpdeform.core.errors import InputError
     from cpdeform.core.plugins import load_registry, split_options
     from cpdeform.core.task import merge, validate
+    from cpdeform.run.command import FLAGS
     from cpdeform.run.configuration import RunConfiguration
     from cpdeform.run.record_reader import load_record
     from cpdeform.run.resolve import resolve
@@ -148,6 +136,7 @@ def _execute(resolved: ResolvedRun, out: Path | None, *, overwrite: bool, silent
         configuration=configuration,
         overwrite=overwrite,
         resumed_from=resolved.record,
+        origins=resolved.origins,
     )
     try:
         with recorder, _progress(configuration.stages, resolved.first_stage, silent=silent) as observers:

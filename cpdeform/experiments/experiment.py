@@ -98,7 +98,7 @@ def _row(
 
 def _make(run: PlannedRun, resolved: ResolvedRun, observe: Observe) -> None:
     """Run with a record, in place of what is there; a run that breaks off once it has begun says so in its record."""
-    recorder = RunRecorder(run.directory, configuration=resolved.configuration, overwrite=True)
+    recorder = RunRecorder(run.directory, configuration=resolved.configuration, overwrite=True, origins=resolved.origins)
     forget(run)
     try:
         with recorder, observe(run) as observers:

@@ -21,7 +21,7 @@ import contextlib
 import datetime
 import errno
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -73,6 +73,7 @@ class RunRecorder(Observer):
         configuration: What defines the run, kept in the record.
         overwrite: Allow a directory that is not empty; files of an earlier record are then removed, others are left alone.
         resumed_from: The record that the run goes on from, to be named in this one.
+        origins: Where each value of the configuration comes from, see `cpdeform.run.origins`.
 
     Raises:
         InputError: The directory is not empty (without `overwrite`) or cannot be written, or another run is writing to it.
@@ -85,10 +86,12 @@ class RunRecorder(Observer):
         configuration: RunConfiguration | None = None,
         overwrite: bool = False,
         resumed_from: RunRecord | None = None,
+        origins: Mapping[str, str] | None = None,
     ) -> None:
         self.directory = Path(directory)
         self._configuration = configuration
         self._resumed_from = resumed_from
+        self._origins = origins
         self._overwrite = overwrite
         self._run: dict[str, Any] = {}
         self._batch: dict[int, int] = {}
@@ -134,6 +137,7 @@ class RunRecorder(Observer):
                 "recorded_at": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
                 **environment(),
                 "configuration": self._configuration.model_dump(mode="json") if self._configuration else None,
+                "origins": None if self._origins is None else dict(self._origins),
                 # The goal is the copy beside this file.
                 "task": {**task.model_dump(mode="json"), "goal": GOAL_FILE},
             }
@@ -281,6 +285,7 @@ def save_result(
     configuration: RunConfiguration | None = None,
     overwrite: bool = False,
     resumed_from: RunRecord | None = None,
+    origins: Mapping[str, str] | None = None,
 ) -> Path:
     """Write the record of a run that is over, the same as `RunRecorder` writes during one.
 
@@ -290,6 +295,7 @@ def save_result(
         configuration: What defined the run, kept in the record.
         overwrite: As for `RunRecorder`.
         resumed_from: The record that the run went on from.
+        origins: As for `RunRecorder`.
 
     Returns:
         The directory.
@@ -298,7 +304,7 @@ def save_result(
         InputError: The directory is not empty (without `overwrite`) or cannot be written.
         RecordError: Writing failed on the way, e.g. because the disk is full.
     """
-    recorder = RunRecorder(directory, configuration=configuration, overwrite=overwrite, resumed_from=resumed_from)
+    recorder = RunRecorder(directory, configuration=configuration, overwrite=overwrite, resumed_from=resumed_from, origins=origins)
     recorder.run_started(result.task, result.goal, result.names, result.seed)
     for stage in result.stages:
         for iteration in stage.history:

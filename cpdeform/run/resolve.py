@@ -27,6 +27,7 @@ from cpdeform.planning.strategy import Parts, Strategy
 from cpdeform.run.checks.check import warn_about_tools
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.hook_observer import HookObserver
+from cpdeform.run.origins import Origin, trace_origins
 from cpdeform.run.parts import (
     make_objective,
     make_optimizer,
@@ -80,6 +81,7 @@ class ResolvedRun:
         state: Where to start, a single world; None for the scene's start.
         first_stage: Number of the first stage.
         previous: The stages before it.
+        origins: Where each value of the configuration comes from, see `cpdeform.run.origins`.
     """
 
     configuration: RunConfiguration
@@ -91,6 +93,7 @@ class ResolvedRun:
     state: State | None = None
     first_stage: int = 0
     previous: tuple[StageResult, ...] = ()
+    origins: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def names(self) -> dict[str, str]:
@@ -167,7 +170,7 @@ class ResolvedRun:
             stages=self.configuration.stages, state=self.state, first_stage=self.first_stage, previous=self.previous
         )
         fields = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
-        return RunResult(**fields, configuration=self.configuration, resumed_from=self.record)
+        return RunResult(**fields, configuration=self.configuration, resumed_from=self.record, origins=self.origins)
 
 
 def resolve(
@@ -201,10 +204,12 @@ def resolve(
     objects = objects or PartObjects()
     values = given.model_dump(exclude_unset=True) if isinstance(given, RunConfiguration) else current_options(dict(given))
     asked = validate(RunConfiguration, values, source="configuration")
+    layers: list[tuple[Origin, Mapping[str, Any]]] = [(Origin.GIVEN, values)]
     if record is not None:
         if task is not None or "task" in values:
             check_same_task(record, task if task is not None else load_task(asked.task, registry=registry))
         values = resumed_values(record, values)
+        layers.append((Origin.RECORD, values))
         asked = validate(RunConfiguration, values, source="configuration")
     _check_names(asked, objects, registry=registry)
     strategy = objects.strategy or registry.create("strategy", asked.strategy, **asked.strategy_options)
@@ -215,6 +220,7 @@ def resolve(
         task = changed_task(resumed_task(record), scene=asked.scene)
     settings = strategy.settings(task, placer=values.get("placer"))
     configuration = validate(RunConfiguration, merge(settings, values), source=f"strategy {asked.strategy}: settings")
+    layers.append((Origin.STRATEGY, settings))
     device = configuration.device
     configuration = configuration.model_copy(
         update={
@@ -235,7 +241,27 @@ def resolve(
         state=state if record is None else record.state,
         first_stage=first_stage if record is None else record.next_stage,
         previous=() if record is None else record.stages,
+        origins=_origins(configuration, layers, asked, objects),
     )
+
+
+def _origins(
+    configuration: RunConfiguration,
+    layers: Sequence[tuple[Origin, Mapping[str, Any]]],
+    asked: RunConfiguration,
+    objects: PartObjects,
+) -> dict[str, str]:
+    """Where each value comes from; names that "auto" or an object stands for, too."""
+    origins = trace_origins(configuration.model_dump(mode="json"), layers)
+    origins |= {name: Origin.AUTO.value for name in ("backend", "ot") if getattr(asked, name) == AUTO}
+    parts = {
+        "backend": objects.simulator,
+        "ot": objects.ot_solver,
+        "placer": objects.placer,
+        "strategy": objects.strategy,
+        "objective.kind": objects.objective,
+    }
+    return origins | {name: Origin.OBJECT.value for name, part in parts.items() if part is not None}
 
 
 def _check_names(configuration: RunConfiguration, objects: PartObjects, *, registry: Registry) -> None:

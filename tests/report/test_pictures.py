@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from cpdeform.core.errors import InputError
-from cpdeform.core.plugins import load_registry
 from cpdeform.core.scene import (
     ToolBox,
     ToolCapsule,
@@ -19,14 +18,12 @@ from cpdeform.core.scene import (
     ToolTorus,
 )
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.report import draw_run
 from cpdeform.report.animation import draw_animation
 from cpdeform.report.pictures import draw_picture
 from cpdeform.report.render import fit_camera, render
 from cpdeform.report.shapes import tool_surface
-from cpdeform.run.deform import deform
-from cpdeform.run.record import RunRecorder, load_record
+from cpdeform.run.record import load_record
 
 TOOLS = [
     ToolSphere(position=(0, 0, 0), radius=0.1),
@@ -37,19 +34,6 @@ TOOLS = [
     ToolTorus(position=(0, 0, 0), major_radius=0.1, tube_radius=0.03),
     ToolChopsticks(position=(0, 0, 0), radius=0.03, height=0.2, gap=0.1),
 ]
-
-
-@pytest.fixture
-def record(tmp_path, toy_task_file, toy_entry_points):
-    def make(**options):
-        registry = load_registry(toy_entry_points)
-        parts = {"simulator": "toy", "ot_solver": "toy", "placer": "toy", **options}
-        recorder = RunRecorder(tmp_path / "run")
-        optimizer = TrajectoryOptimizer(iterations=3)
-        deform(str(toy_task_file), registry=registry, optimizer=optimizer, observers=[recorder], **parts)
-        return recorder.directory
-
-    return make
 
 
 @pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.kind)
