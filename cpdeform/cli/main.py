@@ -16,7 +16,7 @@ from cpdeform.cli.evaluate import evaluate
 from cpdeform.cli.experiment import experiment
 from cpdeform.cli.interruption import exit_code, interruptible
 from cpdeform.cli.plugins import plugins
-from cpdeform.cli.report import report, view
+from cpdeform.cli.report import draw, report, view
 from cpdeform.cli.run import run
 from cpdeform.cli.strategies import strategies
 from cpdeform.cli.system_limits import system_limit
@@ -71,6 +71,7 @@ app = typer.Typer(
 app.command()(run)
 app.command()(report)
 app.command()(view)
+app.command()(draw)
 app.command()(evaluate)
 app.command()(tasks)
 app.command()(strategies)

@@ -37,6 +37,33 @@ def report(
         webbrowser.open(path.resolve().as_uri())
 
 
+def draw(
+    directory: Record,
+    camera: Annotated[
+        str, typer.Option(help="default, front, side, top, back, or azimuth and elevation in degrees.", metavar="NAME|A,E")
+    ] = "default",
+    what: Annotated[
+        list[str] | None,
+        typer.Option(help="picture, sheet, curves, mp4 or gif; repeatable. Defaults to all but gif.", metavar="NAME"),
+    ] = None,
+) -> None:
+    """Draw the pictures of a run into its record: picture, contact sheet of all stages, learning curves, animation.
+
+    Examples:
+      cpdeform draw runs/star
+
+      cpdeform draw runs/star --what sheet --camera top
+    """
+    from cpdeform.core.errors import InputError
+    from cpdeform.report.draw import PICTURES, draw_chosen
+
+    for name in what or ():
+        if name not in PICTURES:
+            raise InputError("--what", came=f'"{name}"', expected=", ".join(PICTURES))
+    for path in draw_chosen(directory, tuple(what or PICTURES[:-1]), camera=camera):
+        typer.echo(str(path))
+
+
 def view(
     directory: Record,
     port: Annotated[int, typer.Option(help="Port on this machine; 0 for any free one.", min=0, max=65535)] = 0,

@@ -13,6 +13,9 @@ Array = NDArray[np.float64]
 LEVEL = 0.5
 """Share of the density inside of a body at which its surface is drawn."""
 
+LOOSE = 0.1
+"""Share of it below which a particle is a crumb, which no surface shows."""
+
 MARGIN = 3
 """Empty nodes around the particles."""
 
@@ -25,11 +28,13 @@ class Mesh:
         vertices: Corners (V, 3), length units.
         normals: Unit normals (V, 3) at the corners, outwards.
         triangles: Indices (F, 3) of the corners, counter-clockwise seen from outside.
+        loose: Indices (L,) of the particles that are crumbs outside of it.
     """
 
     vertices: Array
     normals: Array
     triangles: NDArray[np.int64]
+    loose: NDArray[np.int64]
 
 
 def particle_spacing(positions: Array) -> float:
@@ -57,24 +62,29 @@ def clay_surface(positions: Array, *, spacing: float | None = None, smoothing: f
         smoothing: Standard deviation of the Gaussian that makes particles a density, in units of `spacing`.
 
     Returns:
-        The mesh; empty where the cloud is.
+        The mesh; empty where nothing of the cloud is dense enough for a surface.
 
     References:
         .. [1] Lewiner, Lopes, Vieira, Tavares, "Efficient implementation of marching cubes' cases with topological guarantees",
            Journal of Graphics Tools, 2003.
     """
-    from scipy.ndimage import gaussian_filter
+    from scipy.ndimage import gaussian_filter, map_coordinates
     from skimage.measure import marching_cubes
 
-    points = positions[np.isfinite(positions).all(axis=1)]
+    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    points = positions[known]
     if not len(points):
-        return Mesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), known)
     spacing = spacing or particle_spacing(points)
     origin = points.min(axis=0) - (MARGIN + 3.0 * smoothing) * spacing
     shape = np.ceil((points.max(axis=0) - origin) / spacing + MARGIN + 3.0 * smoothing).astype(int) + 1
-    density = gaussian_filter(deposit((points - origin) / spacing, shape), smoothing)
-    vertices, triangles, normals, _ = marching_cubes(density, LEVEL if density.max() > LEVEL else 0.5 * float(density.max()))
-    return Mesh(vertices * spacing + origin, _unit(normals), triangles[:, ::-1].astype(np.int64))
+    places = (points - origin) / spacing
+    density = gaussian_filter(deposit(places, shape), smoothing)
+    loose = known[map_coordinates(density, places.T, order=1) < LOOSE]
+    if density.max() <= LEVEL:
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), known)
+    vertices, triangles, normals, _ = marching_cubes(density, LEVEL)
+    return Mesh(vertices * spacing + origin, _unit(normals), triangles[:, ::-1].astype(np.int64), loose)
 
 
 def deposit(places: Array, shape: Any) -> Array:

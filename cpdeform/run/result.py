@@ -47,3 +47,9 @@ class RunResult(DeformResult):
             resumed_from=self.resumed_from,
             origins=self.origins,
         )
+
+    def _repr_html_(self) -> str:
+        """How a notebook shows it: pictures, losses, metric."""
+        from cpdeform.run.notebook import result_html
+
+        return result_html(self)

@@ -78,10 +78,19 @@ def test_surface_of_a_ball_is_the_ball():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_surface_of_next_to_nothing(count):
-    mesh = clay_surface(np.full((count, 3), 0.4))
-    assert np.isfinite(mesh.vertices).all()
-    assert (len(mesh.vertices) > 0) == (count > 0)
+def test_next_to_nothing_has_no_surface_and_is_loose(count):
+    mesh = clay_surface(np.full((count, 3), 0.4) + np.arange(count)[:, None] * 0.1)
+    assert mesh.vertices.shape == mesh.normals.shape == (0, 3)
+    assert list(mesh.loose) == list(range(count))
+
+
+def test_crumbs_are_loose_and_the_body_is_not():
+    random = np.random.default_rng(5)
+    body, crumbs = random.uniform(0.4, 0.6, (4000, 3)), np.array([[0.8, 0.5, 0.5], [0.1, 0.2, 0.7], [0.5, np.nan, 0.5]])
+    mesh = clay_surface(np.concatenate([body, crumbs]))
+    assert {4000, 4001} <= set(mesh.loose)
+    assert 4002 not in mesh.loose
+    assert len(mesh.loose) < 40
 
 
 def test_goal_distance_is_that_from_the_goal():

@@ -22,7 +22,7 @@ def serve(tmp_path):
 
     def start(directory):
         server = PageServer(directory)
-        threading.Thread(goal=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
         servers.append(server)
         return server.address
 

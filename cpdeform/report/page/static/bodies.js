@@ -20,25 +20,31 @@ class Clay {
     geometry.setAttribute("slope", new BufferAttribute(new Int8Array(3 * content.particles), 3, true));
     geometry.setAttribute("level", new BufferAttribute(new Uint8Array(content.particles), 1, true));
     for (const object of [this.particles, this.surface]) object.frustumCulled = false;
-    this.particles.visible = false;
+    this.asParticles = false;
   }
 
   /** Shows positions (lengths, Float32Array); `levels` gives a byte to each particle, `place` one to each place; null for neither. */
   show(positions, { levels, place }) {
-    if (this.particles.visible) this.showParticles(positions, place ? place(positions) : levels);
-    else this.showSurface(positions, levels, place);
+    this.surface.visible = !this.asParticles;
+    const density = new Density(positions, this.spacing, this.asParticles ? null : levels);
+    const shown = this.asParticles ? null : looseParticles(positions, density);
+    this.showParticles(positions, place ? place(positions) : levels, shown, density);
+    if (!this.asParticles) this.showSurface(density, place);
   }
 
-  showParticles(positions, levels) {
+  /** Shows all particles, or those of the numbers in `shown`: crumbs that no surface shows. */
+  showParticles(positions, levels, shown, density) {
     const { attributes } = this.particles.geometry;
-    const put = (name, values) => { attributes[name].array.set(values); attributes[name].needsUpdate = true; };
-    put("position", positions);
-    put("slope", particleNormals(positions, this.spacing));
-    if (levels) put("level", levels);
+    const pick = (values, size) => (shown === null ? values : values.constructor.from(shown.flatMap((at) => Array.from(values.subarray(size * at, size * at + size)))));
+    const put = (name, values, size) => { attributes[name].array.set(pick(values, size)); attributes[name].needsUpdate = true; };
+    put("position", positions, 3);
+    put("slope", shown === null ? particleNormals(positions, density) : new Int8Array(positions.length), 3);
+    if (levels) put("level", levels, 1);
+    this.particles.geometry.setDrawRange(0, shown === null ? positions.length / 3 : shown.length);
   }
 
-  showSurface(positions, levels, place) {
-    const mesh = meshDensity(new Density(positions, this.spacing, levels));
+  showSurface(density, place) {
+    const mesh = meshDensity(density);
     const { geometry } = this.surface;
     setAttribute(geometry, "position", mesh.positions, 3);
     setAttribute(geometry, "slope", mesh.normals, 3);

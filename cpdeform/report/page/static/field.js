@@ -1,6 +1,7 @@
 // Fields on grids: the density of clay, whose level set is its surface, and the distance from the goal.
 
 const CELLS_PER_SPACING = 0.8;
+const LOOSE_LEVEL = 0.1;
 const EMPTY_NODES = 4;
 
 /**
@@ -28,7 +29,7 @@ class Density {
     for (let particle = 0; 3 * particle < positions.length; particle += 1) {
       const base = this.locate(positions, 3 * particle, shares);
       for (let corner = 0; corner < 8; corner += 1) {
-        const node = base + this.offset(corner), weight = cornerWeight(corner, shares);
+        const node = base + this.offset(corner), weight = cornerWeight(corner, shares) * CELLS_PER_SPACING ** 3;
         mass[node] += weight;
         if (weighted) weighted[node] += weight * levels[particle];
       }
@@ -81,9 +82,20 @@ function cornerWeight(corner, shares) {
   return (corner & 4 ? shares[0] : 1 - shares[0]) * (corner & 2 ? shares[1] : 1 - shares[1]) * (corner & 1 ? shares[2] : 1 - shares[2]);
 }
 
+/** Numbers of the particles that are crumbs: too few at their places for a surface. */
+function looseParticles(positions, density) {
+  const loose = [], shares = [0, 0, 0];
+  for (let at = 0; at < positions.length; at += 3) {
+    const base = density.locate(positions, at, shares);
+    let value = 0;
+    for (let corner = 0; corner < 8; corner += 1) value += cornerWeight(corner, shares) * density.values[base + density.offset(corner)];
+    if (value < LOOSE_LEVEL) loose.push(at / 3);
+  }
+  return loose;
+}
+
 /** Normals of the clay's surface at all particles, as signed bytes; they are short inside, where the density does not fall off. */
-function particleNormals(positions, spacing) {
-  const density = new Density(positions, spacing, null);
+function particleNormals(positions, density) {
   const normals = new Int8Array(positions.length);
   const shares = [0, 0, 0], slope = [0, 0, 0];
   for (let at = 0; at < positions.length; at += 3) {

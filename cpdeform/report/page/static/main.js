@@ -16,7 +16,7 @@ function makeControls(player) {
   const colours = COLOURS.map((name) => button(name, async () => { player.setColour(name); await player.show(); player.changed(); }, { "data-colour": name }));
   const views = Object.keys(VIEWS).map((name) => button(name === "default" ? "reset" : name, () => player.view.look(...VIEWS[name])));
   const goal = button("goal", () => { player.setGoal(!player.showGoal); player.changed(); }, { id: "goal" });
-  const particles = button("particles", () => player.setParticles(!player.view.clay.particles.visible), { id: "particles" });
+  const particles = button("particles", () => player.setParticles(!player.view.clay.asParticles), { id: "particles" });
   find("toolbar").replaceChildren(group("colour", ...colours), group("show", goal, particles), group("camera", ...views));
   const play = button("play", () => player.play(!player.playing), { id: "play" });
   const time = element("input", { id: "time", type: "range", min: 0, step: "any", "aria-label": "time in the stage" });
@@ -57,7 +57,7 @@ function drawChoice(player) {
   player.moved();
   find("play").textContent = player.playing ? "pause" : "play";
   find("goal").classList.toggle("on", player.showGoal);
-  find("particles").classList.toggle("on", player.view.clay.particles.visible);
+  find("particles").classList.toggle("on", player.view.clay.asParticles);
   for (const one of document.querySelectorAll("[data-colour]")) {
     one.classList.toggle("on", one.dataset.colour === player.colour);
     one.disabled = one.dataset.colour === "priority" && !player.current.priorities;

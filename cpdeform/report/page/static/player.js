@@ -107,8 +107,7 @@ class Player {
   }
 
   async setParticles(on) {
-    this.view.clay.particles.visible = on;
-    this.view.clay.surface.visible = !on;
+    this.view.clay.asParticles = on;
     await this.show();
     this.changed();
   }
