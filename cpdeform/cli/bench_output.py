@@ -56,9 +56,34 @@ def _print_table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, tuple[
             failures.append(f"{_name(row)}: {row['error']}")
     # A table that is piped into a file is not folded to a terminal's width.
     console = Console() if sys.stdout.isatty() else Console(width=200)
-    console.print(table)
+    if console.measure(table).maximum > console.width:
+        _print_blocks(rows, columns)
+    else:
+        console.print(table)
     for failure in failures:
         typer.echo(failure)
+
+
+def print_markdown(text: str) -> None:
+    """Print a page of Markdown: drawn on a terminal, as it is into a file."""
+    if not sys.stdout.isatty():
+        typer.echo(text)
+        return
+    from rich.console import Console
+    from rich.markdown import Markdown
+
+    Console().print(Markdown(text))
+
+
+def _print_blocks(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, tuple[str, str]]) -> None:
+    """Print each row as lines of a title and a figure, for a terminal that is too narrow for the table."""
+    from cpdeform.experiments.tables import cell
+
+    width = max(len(title) for title, _ in columns.values())
+    for row in rows:
+        for name, (title, pattern) in columns.items():
+            typer.echo(f"{title:<{width}}  {cell(row[name], pattern)}")
+        typer.echo("")
 
 
 def told(rows: Iterable[dict[str, Any]], *, count: int) -> Iterator[dict[str, Any]]:

@@ -59,6 +59,7 @@ def draw_curves(record: RunRecord) -> Path | None:
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     lines = [line for line in record.metrics if line.get("kind") == "iteration"]
     stages = sorted({int(line["stage"]) for line in lines})
@@ -76,6 +77,7 @@ def draw_curves(record: RunRecord) -> Path | None:
             axis.plot(range(1, len(losses) + 1), losses, linewidth=1.1)
         axis.set_title(f"stage {stage + 1}", fontsize=9)
         axis.tick_params(labelsize=7)
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.set_xlabel("iteration", fontsize=7)
         axis.set_ylabel("loss", fontsize=7)
     for axis in axes.flat[len(stages) :]:

@@ -4,27 +4,12 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping
 from typing import Any
 
+from cpdeform.run.flags import FLAGS
 from cpdeform.run.origins import Origin, flatten
 from cpdeform.run.record_reader import RunRecord
 from cpdeform.run.resume import recorded_configuration
-
-FLAGS: Mapping[str, str] = {
-    "task": "TASK",
-    "backend": "--backend",
-    "ot": "--ot",
-    "placer": "--placer",
-    "strategy": "--strategy",
-    "device": "--device",
-    "seed": "--seed",
-    "stages": "--stages",
-    "steps": "--steps",
-    "goal": "--goal",
-    "optimizer.iterations": "--iterations",
-}
-"""Flag of `cpdeform run` for each field of the configuration that has one."""
 
 
 def command_of(record: RunRecord) -> str | None:

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cpdeform.core.errors import InputError
+from cpdeform.core.errors import InputError, PluginError
 from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.objective import Objective
 from cpdeform.core.old_names import current_options
@@ -221,16 +221,8 @@ def resolve(
     settings = strategy.settings(task, placer=values.get("placer"))
     configuration = validate(RunConfiguration, merge(settings, values), source=f"strategy {asked.strategy}: settings")
     layers.append((Origin.STRATEGY, settings))
-    device = configuration.device
-    configuration = configuration.model_copy(
-        update={
-            "task": configuration.task if configuration.task.endswith((".yaml", ".yml")) else task.name,
-            "backend": registry.resolve("simulator", configuration.backend, device=device)
-            if objects.simulator is None
-            else configuration.backend,
-            "ot": registry.resolve("ot_solver", configuration.ot, device=device) if objects.ot_solver is None else configuration.ot,
-        }
-    )
+    task_name = configuration.task if configuration.task.endswith((".yaml", ".yml")) else task.name
+    configuration = configuration.model_copy(update={"task": task_name, **_chosen_parts(configuration, objects, registry=registry)})
     return ResolvedRun(
         configuration=configuration,
         task=task,
@@ -262,6 +254,23 @@ def _origins(
         "objective.kind": objects.objective,
     }
     return origins | {name: Origin.OBJECT.value for name, part in parts.items() if part is not None}
+
+
+def _chosen_parts(configuration: RunConfiguration, objects: PartObjects, *, registry: Registry) -> dict[str, str]:
+    """Names of the simulator and of the transport solver, chosen where they are "auto"; all that is missing is told at once."""
+    chosen, missing = {}, []
+    for field, kind, part in (("backend", "simulator", objects.simulator), ("ot", "ot_solver", objects.ot_solver)):
+        name = getattr(configuration, field)
+        try:
+            chosen[field] = name if part is not None else registry.resolve(kind, name, device=configuration.device)
+        except PluginError as error:
+            missing.append(error)
+    if len(missing) > 1:
+        remedy = 'pip install "cpdeform[all]" brings all of them.'
+        raise PluginError(f"{' '.join(map(str, missing))} {remedy}") from missing[0]
+    if missing:
+        raise missing[0]
+    return chosen
 
 
 def _check_names(configuration: RunConfiguration, objects: PartObjects, *, registry: Registry) -> None:
