@@ -12,6 +12,9 @@ import typer
 if TYPE_CHECKING:
     from cpdeform.core.plugins import Registry
 
+UNFOLDED = 10_000
+"""Width of a terminal that no table is folded for, characters."""
+
 
 def report(
     rows: Sequence[Mapping[str, Any]],
@@ -42,6 +45,7 @@ def _print_table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, tuple[
     """Print a table; a row without figures has its reason below it."""
     from rich import box
     from rich.console import Console
+    from rich.measure import Measurement
     from rich.table import Table
 
     from cpdeform.experiments.tables import cell
@@ -56,7 +60,8 @@ def _print_table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, tuple[
             failures.append(f"{_name(row)}: {row['error']}")
     # A table that is piped into a file is not folded to a terminal's width.
     console = Console() if sys.stdout.isatty() else Console(width=200)
-    if console.measure(table).maximum > console.width:
+    wanted = Measurement.get(console, console.options.update(max_width=UNFOLDED), table).maximum
+    if wanted > console.width:
         _print_blocks(rows, columns)
     else:
         console.print(table)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from cpdeform.core.plugins import Registry
 
 PARTS = {"simulator": "--backend", "ot_solver": "--ot"}
+NO_COMPILER = "none: the native simulator and solver cannot be built; Warp and GeomLoss take their place"
 COMPILERS = ("c++", "g++", "clang++", "cl")
 
 
@@ -102,9 +103,9 @@ def _text(found: dict[str, Any]) -> str:
     lines += [f"failed to load: {failure}" for failure in found["failures"]]
     missing = [name for name, there in found["pictures"].items() if not there]
     lines += [
-        f"compiler  {found['compiler'] or 'none: the native simulator and solver cannot be built; Warp and GeomLoss take their place'}",
+        f"compiler  {found['compiler'] or NO_COMPILER}",
         f"GPU       {', '.join(found['cuda']) or 'none that torch sees'}",
-        f"pictures  {'missing: ' + ', '.join(missing) + '; pip install cpdeform[report]' if missing else 'all that they need is there'}",
+        f"pictures  {'missing: ' + ', '.join(missing) if missing else 'all that they need is there'}",
         *(f"cache     {name}: {folder}" for name, folder in found["caches"].items()),
     ]
     return "\n".join(lines)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterator
 
@@ -140,7 +141,7 @@ def _sums(record: RunRecord) -> Iterator[Check]:
     for name, made in parts.items():
         if stages and run.get(name) is not None:
             yield Check(name.replace("_", " "), _number(run[name]), made(), EXACT)
-    for before, after in zip(stages, stages[1:], strict=False):
+    for before, after in itertools.pairwise(stages):
         name = f"stage {after.index + 1}: distance of its beginning from the end of stage {before.index + 1}"
         yield Check(name, 0.0, _distances(before.state.position[0], after.state_before.position[0])[1], EXACT)
 
