@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from cpdeform.planning.pruner import Pruner
     from cpdeform.planning.result import DeformResult, Observer, StageResult, Status
     from cpdeform.planning.strategy import Strategy
+    from cpdeform.report.public import render
     from cpdeform.run.deform import deform
     from cpdeform.run.record_reader import RunRecord, load_record
     from cpdeform.run.result import RunResult
@@ -55,6 +56,7 @@ _MODULES = {
     "cpdeform.planning.pruner": ("Pruner",),
     "cpdeform.planning.result": ("DeformResult", "Observer", "StageResult", "Status"),
     "cpdeform.planning.strategy": ("Strategy",),
+    "cpdeform.report.public": ("render",),
     "cpdeform.run.deform": ("deform",),
     "cpdeform.run.record_reader": ("RunRecord", "load_record"),
     "cpdeform.run.result": ("RunResult",),
@@ -102,6 +104,7 @@ __all__ = [
     "load_record",
     "load_registry",
     "load_task",
+    "render",
 ]
 
 

@@ -52,7 +52,7 @@ def test_picture() -> None:
     surface = tool_surface(CONE, pose, rows=200, columns=200)
     camera = fit_camera(np.array([[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]]), azimuth=0.0, elevation=0.0, aspect=1.0)
     particle, colour = np.array([[0.0, 0.09, 0.0]]), np.array([[1.0, 0.0, 0.0]])
-    picture = render(camera, width=100, particles=particle, colours=colour, radius=1e-3, tools=[surface])
+    picture = render(camera, width=100, particles=particle, colours=colour, spacing=1e-3, tools=[surface])
     rows, columns = np.nonzero(picture[..., 3] > 0.3)
     widths = [np.ptp(columns[rows == row]) for row in np.unique(rows[rows > 25])]
     # Narrow at its tip, which is above, and as wide as high by 0.1 to 0.12 at its base.

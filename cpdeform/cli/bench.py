@@ -46,13 +46,13 @@ SIMULATOR_NOTE = (
 @bench.command("simulators")
 def bench_simulators_command(
     backends: Annotated[
-        str | None, typer.Option(help="Names, separated by commas.  [default: all that are installed]", metavar="NAMES")
+        str | None, typer.Option(help="Names, separated by commas. Defaults to all that are installed.", metavar="NAMES")
     ] = None,
     particles: Annotated[str, typer.Option(help="Numbers of particles, separated by commas.")] = "1000,10000,100000",
     worlds: Annotated[str, typer.Option(help="Numbers of worlds, separated by commas.")] = "1,4,16",
-    threads: Annotated[str | None, typer.Option(help="Numbers of threads.  [default: the cores at hand]")] = None,
+    threads: Annotated[str | None, typer.Option(help="Numbers of threads. Defaults to the cores at hand.")] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.", metavar="NAME")] = "cpu",
-    dtype: Annotated[str | None, typer.Option(help="float32 or float64.  [default: each backend's]", metavar="NAME")] = None,
+    dtype: Annotated[str | None, typer.Option(help="float32 or float64. Defaults to each backend's.", metavar="NAME")] = None,
     steps: Annotated[int, typer.Option(help="Environment steps of a rollout.")] = 2,
     repeat: Annotated[int, typer.Option(help="Rollouts and gradients timed; the median counts.")] = 3,
     timeout: Annotated[float, typer.Option(help="Seconds after which a combination is given up.")] = 600.0,

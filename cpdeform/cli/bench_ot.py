@@ -33,12 +33,12 @@ OT_NOTE = (
 
 def bench_ot_command(
     solvers: Annotated[
-        str | None, typer.Option(help="Names, separated by commas.  [default: all that are installed]", metavar="NAMES")
+        str | None, typer.Option(help="Names, separated by commas. Defaults to all that are installed.", metavar="NAMES")
     ] = None,
     points: Annotated[
         str, typer.Option(help="Numbers of points of each cloud, separated by commas.")
     ] = "1000,2000,5000,10000,20000",
-    threads: Annotated[str | None, typer.Option(help="Numbers of threads.  [default: the cores at hand]")] = None,
+    threads: Annotated[str | None, typer.Option(help="Numbers of threads. Defaults to the cores at hand.")] = None,
     blur: Annotated[float, typer.Option(help="Entropic blur, length units.")] = 2e-3,
     device: Annotated[str, typer.Option(help="cpu or cuda.", metavar="NAME")] = "cpu",
     steps: Annotated[int, typer.Option(help="Warm calls, after each of which the points move by 1e-3 RMS.")] = 10,

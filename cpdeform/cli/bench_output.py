@@ -12,6 +12,9 @@ import typer
 if TYPE_CHECKING:
     from cpdeform.core.plugins import Registry
 
+UNFOLDED = 10_000
+"""Width of a terminal that no table is folded for, characters."""
+
 
 def report(
     rows: Sequence[Mapping[str, Any]],
@@ -42,6 +45,7 @@ def _print_table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, tuple[
     """Print a table; a row without figures has its reason below it."""
     from rich import box
     from rich.console import Console
+    from rich.measure import Measurement
     from rich.table import Table
 
     from cpdeform.experiments.tables import cell
@@ -56,9 +60,35 @@ def _print_table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, tuple[
             failures.append(f"{_name(row)}: {row['error']}")
     # A table that is piped into a file is not folded to a terminal's width.
     console = Console() if sys.stdout.isatty() else Console(width=200)
-    console.print(table)
+    wanted = Measurement.get(console, console.options.update(max_width=UNFOLDED), table).maximum
+    if wanted > console.width:
+        _print_blocks(rows, columns)
+    else:
+        console.print(table)
     for failure in failures:
         typer.echo(failure)
+
+
+def print_markdown(text: str) -> None:
+    """Print a page of Markdown: drawn on a terminal, as it is into a file."""
+    if not sys.stdout.isatty():
+        typer.echo(text)
+        return
+    from rich.console import Console
+    from rich.markdown import Markdown
+
+    Console().print(Markdown(text))
+
+
+def _print_blocks(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, tuple[str, str]]) -> None:
+    """Print each row as lines of a title and a figure, for a terminal that is too narrow for the table."""
+    from cpdeform.experiments.tables import cell
+
+    width = max(len(title) for title, _ in columns.values())
+    for row in rows:
+        for name, (title, pattern) in columns.items():
+            typer.echo(f"{title:<{width}}  {cell(row[name], pattern)}")
+        typer.echo("")
 
 
 def told(rows: Iterable[dict[str, Any]], *, count: int) -> Iterator[dict[str, Any]]:

@@ -95,15 +95,15 @@ def check_placer_command(name: Name, settings: Settings = None, only: Only = Non
 @check.command("golden")
 def check_golden_command(
     directory: Annotated[Path, typer.Argument(help="Folder with golden files, e.g. torus-v2-seed0.npz.", metavar="DIR")],
-    backend: Annotated[list[str] | None, typer.Option(help="Simulator; repeatable.  [default: warp]", metavar="NAME")] = None,
+    backend: Annotated[list[str] | None, typer.Option(help="Simulator; repeatable. Defaults to warp.", metavar="NAME")] = None,
     scenes: Annotated[
-        Path | None, typer.Option(help="Scene definitions.  [default: DIR/../plasticinelab/scenes.json]", metavar="FILE")
+        Path | None, typer.Option(help="Scene definitions. Defaults to DIR/../plasticinelab/scenes.json.", metavar="FILE")
     ] = None,
     goals: Annotated[
-        Path | None, typer.Option(help="Target grids.  [default: DIR/../plasticinelab/target_grids.npz]", metavar="FILE")
+        Path | None, typer.Option(help="Target grids. Defaults to DIR/../plasticinelab/target_grids.npz.", metavar="FILE")
     ] = None,
     device: Device = "cpu",
-    dtype: Annotated[str | None, typer.Option(help="float32 or float64.  [default: the backend's]", metavar="NAME")] = None,
+    dtype: Annotated[str | None, typer.Option(help="float32 or float64. Defaults to the backend's.", metavar="NAME")] = None,
     settings: Settings = None,
     allow_unsupported: Annotated[
         bool, typer.Option("--allow-unsupported", help="Scenes that the backend declares it cannot run do not count as failures.")

@@ -22,7 +22,7 @@ def evaluate(
         bool, typer.Option("--paper", help="Also the paper's Wasserstein distance: GeomLoss's schedule (minutes).")
     ] = False,
     paper_blur: Annotated[
-        float | None, typer.Option(help="Its blur.  [default: 1e-3, or 1e-5 for tasks of several stages]", metavar="LENGTH")
+        float | None, typer.Option(help="Its blur. Defaults to 1e-3, or 1e-5 for tasks of several stages.", metavar="LENGTH")
     ] = None,
     exact: Annotated[bool, typer.Option("--exact", help="Also the exact Wasserstein distance (minutes, gigabytes).")] = False,
     at_rest: Annotated[

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cpdeform.cli.bench_output import check_device, split_names, split_numbers
+from cpdeform.cli.bench_output import check_device, print_markdown, split_names, split_numbers
 from cpdeform.cli.interruption import exit_code
 from cpdeform.core.errors import InputError
 
@@ -42,30 +42,30 @@ def experiment(
     ],
     tasks: Annotated[
         str | None,
-        typer.Option(help="Names or YAML files, separated by commas.  [default: all of the experiment]", metavar="NAMES"),
+        typer.Option(help="Names or YAML files, separated by commas. Defaults to all of the experiment.", metavar="NAMES"),
     ] = None,
     variants: Annotated[
         str | None,
-        typer.Option(help="(single-stage) Variants of tasks named without one.  [default: v1,v2,v3]", metavar="NAMES"),
+        typer.Option(help="(single-stage) Variants of tasks named without one. Defaults to v1,v2,v3.", metavar="NAMES"),
     ] = None,
     methods: Annotated[
         str | None,
-        typer.Option(help="Of cpdeform, paper, fixed and random, separated by commas.  [default: cpdeform,fixed]", metavar="NAMES"),
+        typer.Option(help="Of cpdeform, paper, fixed, random, separated by commas. Defaults to cpdeform,fixed.", metavar="NAMES"),
     ] = None,
-    seeds: Annotated[str | None, typer.Option(help="Seeds, separated by commas.  [default: 0]", metavar="NUMBERS")] = None,
-    iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: the task's, or 40]")] = None,
-    stages: Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Seeds, separated by commas. Defaults to 0.", metavar="NUMBERS")] = None,
+    iterations: Annotated[int | None, typer.Option(help="The most gradient steps a stage. Defaults to the task's, or 40.")] = None,
+    stages: Annotated[int | None, typer.Option(help="Number of stages. Defaults to the task's.")] = None,
     particles: Annotated[
-        int | None, typer.Option(help="Particles of all bodies together; goals stay as they are.  [default: the task's]")
+        int | None, typer.Option(help="Particles of all bodies together; goals stay as they are. Defaults to the task's.")
     ] = None,
     goals: Annotated[
         Path | None, typer.Option(help="Directory with a goal <task>.npz for every task, instead of their own.", metavar="DIR")
     ] = None,
     backend: Annotated[
-        str | None, typer.Option(help="Simulator; auto: the fastest installed.  [default: auto]", metavar="NAME")
+        str | None, typer.Option(help="Simulator; auto: the fastest installed. Defaults to auto.", metavar="NAME")
     ] = None,
-    ot: Annotated[str | None, typer.Option(help="Optimal-transport solver.  [default: auto]", metavar="NAME")] = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda.  [default: cpu]", metavar="NAME")] = None,
+    ot: Annotated[str | None, typer.Option(help="Optimal-transport solver. Defaults to auto.", metavar="NAME")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda. Defaults to cpu.", metavar="NAME")] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Any other option of `cpdeform run`, for all runs; repeatable.", metavar="KEY=VALUE"),
@@ -76,7 +76,7 @@ def experiment(
     paper_metric: Annotated[bool, typer.Option("--paper-metric", help="Also take W1 with the paper's settings.")] = False,
     shape: Annotated[bool, typer.Option("--shape", help="Also take the shape figures, from rest to rest.")] = False,
     out: Annotated[
-        Path | None, typer.Option(help="Directory of records and tables.  [default: experiments/<experiment>]", metavar="DIR")
+        Path | None, typer.Option(help="Directory of records and tables. Defaults to experiments/<experiment>.", metavar="DIR")
     ] = None,
     resume: Annotated[
         bool,
@@ -287,7 +287,7 @@ def _report(name: str, rows: Sequence[ExperimentRow], settings: dict[str, Any], 
         }
         typer.echo(json.dumps(to_json(content), default=str))
     else:
-        typer.echo((out / TABLE_FILE).read_text(encoding="utf-8"))
+        print_markdown((out / TABLE_FILE).read_text(encoding="utf-8"))
         typer.echo(f"written to {out / TABLE_FILE}")
     if not any(row.has_figures for row in rows):
         raise typer.Exit(1)

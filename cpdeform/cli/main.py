@@ -13,10 +13,13 @@ from cpdeform import __version__
 from cpdeform.cli.bench import bench
 from cpdeform.cli.check import check
 from cpdeform.cli.dataset import dataset
+from cpdeform.cli.doctor import doctor
 from cpdeform.cli.evaluate import evaluate
 from cpdeform.cli.experiment import experiment
 from cpdeform.cli.interruption import exit_code, interruptible
 from cpdeform.cli.plugins import plugins
+from cpdeform.cli.recorded import config, replay, verify
+from cpdeform.cli.report import draw, report, view
 from cpdeform.cli.run import run
 from cpdeform.cli.strategies import strategies
 from cpdeform.cli.sweep import sweep
@@ -65,12 +68,18 @@ def _show_warning(
 app = typer.Typer(
     cls=ErrorGroup,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command()(run)
+app.command()(report)
+app.command()(view)
+app.command()(draw)
 app.command()(evaluate)
+app.command()(config)
+app.command()(replay)
+app.command()(verify)
+app.command()(doctor)
 app.command()(tasks)
 app.command()(strategies)
 app.command()(experiment)

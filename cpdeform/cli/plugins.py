@@ -28,13 +28,18 @@ def plugins(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON
         typer.echo(json.dumps({"plugins": parts, "failures": failures}))
         return
     kind = ""
+    tasks = [part for part in parts if part["kind"] == "task" and part["available"]]
     for part in parts:
+        if part in tasks:
+            continue
         if part["kind"] != kind:
             kind = part["kind"]
             typer.echo(kind)
         typer.echo(f"  {part['name']:<14} {part['summary']}  [{part['distribution']}]")
         if not part["available"]:
             typer.echo(f"  {'':<14} not available: {part['reason']}")
+    if tasks:
+        typer.echo(f"task\n  {len(tasks)} tasks, see `cpdeform tasks`")
     for failure in failures:
         typer.echo(f"failed to load: {failure['entry_point']} [{failure['distribution']}]: {failure['reason']}")
 

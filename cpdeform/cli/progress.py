@@ -10,6 +10,7 @@ from types import TracebackType
 import typer
 from rich import progress as rich_progress
 from rich.console import Console
+from rich.text import Text
 from torch import Tensor
 
 from cpdeform.core.task import Task
@@ -20,12 +21,19 @@ SECONDS_BETWEEN_LINES = 15.0
 
 
 class Progress(Observer):
-    """What bar and lines have in common: they tell the memory that rollouts are about to need."""
+    """What bar and lines have in common: the number of the batch, and the memory that rollouts are about to need."""
 
     _told = 0
+    _batch = 0
+
+    def part_started(self, stage: int, part: str) -> None:
+        """Count batches anew in each stage."""
+        if part == "transport":
+            self._batch = 0
 
     def optimization_started(self, stage: int, worlds: int, memory_estimate: int) -> None:
-        """Print the memory estimate, unless it was told for no smaller a batch."""
+        """Count the batch; print the memory estimate, unless it was told for no smaller a batch."""
+        self._batch += 1
         if memory_estimate > self._told:
             self._told = memory_estimate
             self._print(f"memory: about {megabytes(memory_estimate)} for rollouts and gradients, worlds {worlds}")
@@ -49,6 +57,14 @@ class Starting(Observer):
         self._begin()
 
 
+class _Count(rich_progress.ProgressColumn):
+    """Iterations done and planned; nothing while their number is unknown."""
+
+    def render(self, task: rich_progress.Task) -> Text:
+        """See rich."""
+        return Text("" if task.total is None else f"{task.completed:.0f}/{task.total:.0f}")
+
+
 class ProgressBar(Progress):
     """A bar with stage, iteration, loss, best loss and time left; for terminals. A context manager.
 
@@ -63,7 +79,7 @@ class ProgressBar(Progress):
         self._progress = rich_progress.Progress(
             rich_progress.TextColumn("{task.description}"),
             rich_progress.BarColumn(),
-            rich_progress.TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+            _Count(),
             rich_progress.TimeElapsedColumn(),
             rich_progress.TextColumn("left"),
             rich_progress.TimeRemainingColumn(),
@@ -83,6 +99,12 @@ class ProgressBar(Progress):
         """Learn the number of stages."""
         self._stages = self._stages or task.stage_count
 
+    def part_started(self, stage: int, part: str) -> None:
+        """Say what goes on, so that the screen is not blank while transport is solved."""
+        super().part_started(stage, part)
+        total = self._first_stage + (self._stages or 1)
+        self._progress.update(self._bar, visible=True, description=f"stage {stage + 1}/{total}  {part}")
+
     def iteration_finished(self, stage: int, iteration: Iteration) -> None:
         """Move the bar; a refinement, whose length is its own, only changes the text."""
         if iteration.phase != SEARCH:
@@ -94,7 +116,7 @@ class ProgressBar(Progress):
             visible=True,
             total=total,
             completed=(stage - self._first_stage) * iteration.count + iteration.index + 1,
-            description=f"stage {stage + 1}/{self._first_stage + (self._stages or 1)}  {_losses(iteration)}",
+            description=f"stage {stage + 1}/{self._first_stage + (self._stages or 1)}, batch {self._batch}  {_losses(iteration)}",
         )
 
     def stage_finished(self, result: StageResult) -> None:
@@ -111,12 +133,18 @@ class ProgressLines(Progress):
     def __init__(self) -> None:
         self._next = time.monotonic() + SECONDS_BETWEEN_LINES
 
+    def part_started(self, stage: int, part: str) -> None:
+        """Print a line where a stage begins, before transport, which may take a while."""
+        super().part_started(stage, part)
+        if part == "transport":
+            self._print(f"stage {stage + 1}: {part}")
+
     def iteration_finished(self, stage: int, iteration: Iteration) -> None:
         """Print a line if the last one is some time ago."""
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + SECONDS_BETWEEN_LINES
             name = "iteration" if iteration.phase == SEARCH else iteration.phase
-            text = f"stage {stage + 1}, {name} {iteration.index + 1}/{iteration.count}, {_losses(iteration)}"
+            text = f"stage {stage + 1}, batch {self._batch}, {name} {iteration.index + 1}/{iteration.count}, {_losses(iteration)}"
             self._print(text)
 
     def stage_finished(self, result: StageResult) -> None:

@@ -13,51 +13,48 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cpdeform.cli.interruption import exit_code
+from cpdeform.run.flags import FLAGS
 
 if TYPE_CHECKING:
+    from cpdeform.core.plugins import Registry
     from cpdeform.planning.result import DeformResult, Observer
     from cpdeform.run.record import RunRecorder
     from cpdeform.run.resolve import ResolvedRun
 
-FLAGS = {
-    "task": "TASK",
-    "backend": "--backend",
-    "ot": "--ot",
-    "placer": "--placer",
-    "strategy": "--strategy",
-    "device": "--device",
-    "seed": "--seed",
-    "stages": "--stages",
-    "steps": "--steps",
-    "goal": "--goal",
-    "workers": "--workers",
-    "optimizer.iterations": "--iterations",
-}
-"""Flag of each field of the configuration that has one, for messages."""
-
 SOURCE = "--set"
+
+KINDS = {"backend": "simulator", "ot": "ot_solver", "placer": "placer", "strategy": "strategy"}
+"""What the names that flags give are registered as."""
+
+REPLACED = {
+    "algorithm": ("a strategy", "Use --strategy paper for Algorithm 1 to the letter, --strategy cpdeform for the default."),
+    "optimizer.schedule": ("a pruner", "Use --set optimizer.pruner=halving, or none for all iterations of every candidate."),
+}
+"""Settings of earlier versions: what has taken their place, and how to ask for it."""
 
 
 def run(
-    task: Annotated[str | None, typer.Argument(help="Name, e.g. writer-v2, or a YAML file.  [default: writer]")] = None,
+    task: Annotated[str | None, typer.Argument(help="Name, e.g. writer-v2, or a YAML file. Defaults to writer.")] = None,
     backend: Annotated[
-        str | None, typer.Option(help="Simulator; auto: the fastest installed.  [default: auto]", metavar="NAME")
+        str | None, typer.Option(help="Simulator; auto: the fastest installed. Defaults to auto.", metavar="NAME")
     ] = None,
-    ot: Annotated[str | None, typer.Option(help="Optimal-transport solver.  [default: auto]", metavar="NAME")] = None,
-    placer: Annotated[str | None, typer.Option(help="Where tools are put.  [default: transport]", metavar="NAME")] = None,
+    ot: Annotated[str | None, typer.Option(help="Optimal-transport solver. Defaults to auto.", metavar="NAME")] = None,
+    placer: Annotated[str | None, typer.Option(help="Where tools are put. Defaults to transport.", metavar="NAME")] = None,
     strategy: Annotated[
-        str | None, typer.Option(help="How the search goes, see `cpdeform strategies`.  [default: cpdeform]", metavar="NAME")
+        str | None, typer.Option(help="How the search goes, see `cpdeform strategies`. Defaults to cpdeform.", metavar="NAME")
     ] = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda.  [default: cpu]", metavar="NAME")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of first actions and random placements.  [default: 0]")] = None,
-    stages: Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")] = None,
-    steps: Annotated[int | None, typer.Option(help="Environment steps of a stage.  [default: the task's]")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda. Defaults to cpu.", metavar="NAME")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of first actions and random placements. Defaults to 0.")] = None,
+    stages: Annotated[int | None, typer.Option(help="Number of stages. Defaults to the task's.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Environment steps of a stage. Defaults to the task's.")] = None,
     goal: Annotated[
         Path | None, typer.Option(help="Goal file instead of the task's own, see `cpdeform task import-grid`.", metavar="FILE")
     ] = None,
-    iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: by the task]")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(help="The most gradient steps per stage. Defaults to what fits the task.")
+    ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes that the candidates of a stage are spread over.  [default: 1]", metavar="N")
+        int | None, typer.Option(help="Processes that the candidates of a stage are spread over. Defaults to 1.", metavar="N")
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -68,7 +65,7 @@ def run(
         typer.Option(help="Go on from this run record: its last state, its task, its options under those given.", metavar="DIR"),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Directory of the run record.  [default: runs/<task>-<time>]", metavar="DIR")
+        Path | None, typer.Option(help="Directory of the run record. Defaults to runs/<task>-<time>.", metavar="DIR")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run record in --out.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line, no progress.")] = False,
@@ -76,6 +73,7 @@ def run(
         bool, typer.Option("--dry-run", help="Run nothing; print the configuration with all that was left open, as YAML or JSON.")
     ] = False,
     no_pictures: Annotated[bool, typer.Option("--no-pictures", help="Draw no picture and no animation.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
 ) -> None:
     """Plan how the tools of a task turn its body into its goal, and record the run.
 
@@ -92,11 +90,11 @@ def run(
         return
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         # Libraries print to stdout, too; a reader of the JSON must not see that.
-        result, directory = _execute(resolved, out, overwrite=overwrite, silent=as_json)
+        result, directory = _execute(resolved, out, overwrite=overwrite, silent=as_json or quiet)
         picture = None if no_pictures else _draw(directory)
     if as_json:
         typer.echo(json.dumps(_summary(result, resolved, directory, resumed_from=resume)))
-    else:
+    elif not quiet:
         _print_summary(result, directory, picture, resumed_from=resume)
     if not _finished(result):
         raise typer.Exit(1)
@@ -118,6 +116,11 @@ def resolve_command(
     """
     from cpdeform.core.errors import InputError
     from cpdeform.core.plugins import load_registry, split_options
+
+    registry, values = load_registry(), split_options(settings)
+    _check_replaced(values)
+    _check_names(given, registry, resumed=resume is not None)
+    # What follows takes seconds to import; a typo is answered before.
     from cpdeform.core.task import merge, validate
     from cpdeform.run.configuration import RunConfiguration
     from cpdeform.run.record_reader import load_record
@@ -125,7 +128,6 @@ def resolve_command(
 
     if resume is not None and out is not None and out.resolve() == resume.resolve():
         raise InputError("--out", came="the directory of --resume", expected="another one, for the record of the stages to come")
-    values = split_options(settings)
     for field, value in given.items():
         group, dot, name = field.rpartition(".")
         if dot and not isinstance(values.get(group, {}), dict):
@@ -138,7 +140,30 @@ def resolve_command(
         if field in given:
             raise InputError(FLAGS[field], came=error.came, expected=error.expected, remedy=error.remedy) from error
         raise
-    return resolve(values, registry=load_registry(), record=None if resume is None else load_record(resume))
+    return resolve(values, registry=registry, record=None if resume is None else load_record(resume))
+
+
+def _check_replaced(values: dict[str, Any]) -> None:
+    """Raise `InputError` for settings that have another name now."""
+    from cpdeform.core.errors import InputError
+
+    for name, (expected, remedy) in REPLACED.items():
+        group, _, field = name.rpartition(".")
+        options = values.get(group, {}) if group else values
+        if isinstance(options, dict) and field in options:
+            raise InputError("--set", came=f'"{name}={options[field]}"', expected=expected, remedy=remedy)
+
+
+def _check_names(given: dict[str, Any], registry: Registry, *, resumed: bool) -> None:
+    """Raise an error for names that nothing is registered under, and for a task that cannot be read."""
+    from cpdeform.core.plugins import AUTO
+    from cpdeform.core.task import load_task
+
+    for field, kind in KINDS.items():
+        if given.get(field, AUTO) != AUTO:
+            registry.find(kind, given[field])
+    if "task" in given and not resumed:
+        load_task(given["task"], registry=registry)
 
 
 def _execute(resolved: ResolvedRun, out: Path | None, *, overwrite: bool, silent: bool) -> tuple[DeformResult, Path]:
@@ -152,6 +177,7 @@ def _execute(resolved: ResolvedRun, out: Path | None, *, overwrite: bool, silent
         configuration=configuration,
         overwrite=overwrite,
         resumed_from=resolved.record,
+        origins=resolved.origins,
     )
     try:
         with recorder, _progress(configuration.stages, resolved.first_stage, silent=silent) as observers:

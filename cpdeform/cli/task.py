@@ -32,10 +32,10 @@ def import_grid_command(
     file: Annotated[Path, typer.Argument(help="Node masses: a dense .npy or .npz, or a sparse .npz.", metavar="FILE")],
     out: Annotated[Path, typer.Option(help="Goal file to write, .npz; with --all a directory.", metavar="GOAL")],
     task: Annotated[
-        str | None, typer.Option(help="Task whose scene it is for.  [default: after the grid's name]", metavar="TASK")
+        str | None, typer.Option(help="Task whose scene it is for. Defaults to after the grid's name.", metavar="TASK")
     ] = None,
     name: Annotated[str | None, typer.Option(help="Which grid, where the file holds several.", metavar="NAME")] = None,
-    particles: Annotated[int | None, typer.Option(help="Number of particles.  [default: the body's]")] = None,
+    particles: Annotated[int | None, typer.Option(help="Number of particles. Defaults to the body's.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the sample.")] = 0,
     every: Annotated[bool, typer.Option("--all", help="Import all grids that a task is known for: GOAL/<task>.npz.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,

@@ -36,6 +36,8 @@ class Iteration:
         best_loss: Lowest loss (B,) so far.
         seconds: Wall time of the parts `rollout`, `objective`, `vjp` and `optimizer`.
         memory: Memory of rollout and gradient; measured in one iteration, after the first if there are several, else None.
+        gradient_norm: Euclidean norm (B,) of the gradient by the actions, objective units; nan where there was none. None where
+            it is unknown.
         phase: Name of the phase, e.g. ``"search"``; the losses of another phase may be in another unit.
     """
 
@@ -46,6 +48,7 @@ class Iteration:
     seconds: dict[str, float]
     memory: MemoryUse | None = None
     phase: str = SEARCH
+    gradient_norm: Tensor | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,14 +152,15 @@ class TrajectoryOptimizer:
         history: list[Iteration] = []
         since_improvement = 0
         for index in range(self.iterations):
-            loss, seconds, memory = race.step(
+            loss, norm, seconds, memory = race.step(
                 evaluator,
                 executor,
                 rest_steps=rest_steps,
                 learning_rate=self._rate(index),
                 measured=index == min(1, self.iterations - 1),
             )
-            history.append(Iteration(index, self.iterations, loss, race.best_loss.clone(), seconds, memory))
+            best = race.best_loss.clone()
+            history.append(Iteration(index, self.iterations, loss, best, seconds, memory, gradient_norm=norm))
             if on_iteration is not None:
                 on_iteration(history[-1])
             since_improvement = 0 if race.improved(self.tolerance) else since_improvement + 1

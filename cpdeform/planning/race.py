@@ -64,7 +64,7 @@ class Race:
 
     def step(
         self, evaluator: Evaluator, executor: Executor, *, rest_steps: int, learning_rate: float, measured: bool
-    ) -> tuple[Tensor, dict[str, float], MemoryUse | None]:
+    ) -> tuple[Tensor, Tensor, dict[str, float], MemoryUse | None]:
         """Evaluate the active worlds and let each of them take a step; those that broke for good are active no more.
 
         Args:
@@ -75,7 +75,8 @@ class Race:
             measured: Whether to measure the memory.
 
         Returns:
-            Loss (B,) of the actions tried, nan of worlds that are not active; wall times; memory, where it was measured.
+            Loss (B,) of the actions tried and Euclidean norm (B,) of its gradient, nan of worlds that are not active; wall times;
+            memory, where it was measured.
         """
         active, tried = self.active, self.descent.actions(self.active)
         found = evaluate_worlds(
@@ -91,7 +92,9 @@ class Race:
         self.evaluations += len(active)
         for place, world in enumerate(active.tolist()):
             self.warm[world] = None if found.warm is None else found.warm[place]
-        loss = torch.full_like(self.best_loss, torch.nan).index_copy(0, active, found.loss)
+        unknown = torch.full_like(self.best_loss, torch.nan)
+        loss = unknown.index_copy(0, active, found.loss)
+        norm = unknown.index_copy(0, active, gradient.flatten(1).double().norm(dim=1).cpu())
         sound = torch.isfinite(found.loss) & torch.isfinite(gradient).flatten(1).all(dim=1).cpu()
         self.finite[active] &= sound
         going = sound | self.descent.can_return(active)
@@ -100,7 +103,7 @@ class Race:
         kept = going.to(gradient.device)
         self.descent.step(active[going], found.loss[going], gradient[kept], learning_rate=learning_rate)
         self.active = active[going]
-        return loss, {**found.seconds, "optimizer": time.perf_counter() - start}, found.memory
+        return loss, norm, {**found.seconds, "optimizer": time.perf_counter() - start}, found.memory
 
     def improved(self, tolerance: float) -> bool:
         """Whether any world's best loss fell by this share since it last did."""

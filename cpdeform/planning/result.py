@@ -150,6 +150,9 @@ class Observer:
     def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
         """The parts are ready and checked."""
 
+    def part_started(self, stage: int, part: str) -> None:
+        """A part of a stage begins: ``"transport"``, ``"placement"``, ``"execution"``, or a phase by its name."""
+
     def optimization_started(self, stage: int, worlds: int, memory_estimate: int) -> None:
         """A batch of candidates is about to be optimised; the estimate is that of a rollout and its gradient, bytes."""
 

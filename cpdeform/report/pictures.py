@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,11 +16,15 @@ from cpdeform.core.errors import InputError
 from cpdeform.planning.result import StageResult
 from cpdeform.report.render import Array, Camera, fit_camera, render
 from cpdeform.report.shapes import tool_surface
+from cpdeform.report.surface import particle_spacing
 from cpdeform.run.record import RunRecord
 from cpdeform.run.record_files import replacing
 
-AZIMUTH = 28.0
-ELEVATION = 42.0
+DIRECTIONS: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {"default": (28.0, 42.0), "front": (0.0, 8.0), "side": (90.0, 8.0), "top": (0.0, 89.0), "back": (208.0, 42.0)}
+)
+"""Names of directions to look from: azimuth and elevation, degrees."""
+
 PANEL_ASPECT = 1.15
 CLAY = ("#5b2c1d", "#a8603c", "#dca577", "#f8e6cc")
 """Colours of the clay from low to high."""
@@ -29,21 +36,25 @@ class View:
 
     Attributes:
         camera: From where everything is drawn.
-        radius: Radius that particles are drawn with, length units.
+        spacing: Edge of the cube that a particle has to itself, length units.
         low: Height at the dark end of the clay's colours, length units.
         high: Height at their light end.
         floor: Corners (5, 3) of the rectangle of floor below all shapes, closed, length units.
     """
 
     camera: Camera
-    radius: float
+    spacing: float
     low: float
     high: float
     floor: Array
 
 
-def draw_picture(record: RunRecord) -> Path:
+def draw_picture(record: RunRecord, *, camera: str | tuple[float, float] = "default") -> Path:
     """Draw ``picture.png`` into the record's directory and return its path.
+
+    Args:
+        record: The run.
+        camera: Where to look from, see `direction_of`.
 
     Raises:
         InputError: No stage is complete.
@@ -51,20 +62,20 @@ def draw_picture(record: RunRecord) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    view = make_view(record)
+    view = make_view(record, camera=camera)
     figure = Figure(figsize=(15.0, 4.6), dpi=120, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots(1, 4)
     stage, last = _shown_stage(record), record.stages[-1]
     start, result = record.stages[0].state_before, last.state
     placed = stage.candidates[stage.best].proposal.pose if stage.best is not None else stage.state_before.tool_pose[0]
-    _draw_panel(axes[0], view, record, "start", start.position[0], start.tool_pose[0])
-    _draw_priorities(figure, axes[1], view, record, stage, placed)
+    draw_panel(axes[0], view, record, "start", start.position[0], start.tool_pose[0])
+    draw_priorities(figure, axes[1], view, record, stage, placed)
     title = "result" if last.status.executed or record.finished_stages else "result (no plan was executed)"
-    _draw_panel(axes[2], view, record, title, result.position[0], result.tool_pose[0])
+    draw_panel(axes[2], view, record, title, result.position[0], result.tool_pose[0])
     # The goal often has another number of particles than the body.
-    goal_view = dataclasses.replace(view, radius=_particle_radius(_numbers(record.goal)))
-    _draw_panel(axes[3], goal_view, record, "goal", record.goal, None)
+    goal_view = dataclasses.replace(view, spacing=particle_spacing(_numbers(record.goal)))
+    draw_panel(axes[3], goal_view, record, "goal", record.goal, None)
     _add_height_bar(figure, axes, view)
     figure.suptitle(describe(record), fontsize=13)
     path = record.directory / "picture.png"
@@ -83,12 +94,36 @@ def describe(record: RunRecord) -> str:
     return f"{text}  ({stages} stage{'' if stages == 1 else 's'} executed, status {record.status.replace('_', ' ')})"
 
 
-def make_view(record: RunRecord) -> View:
-    """Camera, particle size and colour range that suit all shapes of a run.
+def direction_of(camera: str | tuple[float, float]) -> tuple[float, float]:
+    """Azimuth and elevation, degrees, of a direction given by its name, as text ("28,42"), or as two numbers.
 
     Raises:
-        InputError: No stage is complete.
+        InputError: It is none of that.
     """
+    if isinstance(camera, str) and camera in DIRECTIONS:
+        return DIRECTIONS[camera]
+    parts = camera.split(",") if isinstance(camera, str) else camera
+    try:
+        azimuth, elevation = (float(part) for part in parts)
+    except (TypeError, ValueError) as error:
+        expected = f"{', '.join(DIRECTIONS)}, or azimuth and elevation in degrees, such as 28,42"
+        raise InputError("camera", came=repr(camera), expected=expected) from error
+    if not (math.isfinite(azimuth) and -90.0 <= elevation <= 90.0):
+        raise InputError("camera", came=repr(camera), expected="an elevation from -90 to 90 degrees")
+    return azimuth, elevation
+
+
+def make_view(record: RunRecord, *, camera: str | tuple[float, float] = "default") -> View:
+    """Camera, particle size and colour range that suit all shapes of a run.
+
+    Args:
+        record: The run.
+        camera: Where to look from, see `direction_of`.
+
+    Raises:
+        InputError: No stage is complete, or the camera is none.
+    """
+    azimuth, elevation = direction_of(camera)
     if not record.stages:
         raise InputError(f"run record {record.directory}", came="no complete stage", expected="at least one to draw")
     goal = record.goal.double().numpy()
@@ -103,8 +138,8 @@ def make_view(record: RunRecord) -> View:
     low, high = clay.min(axis=0), clay.max(axis=0)
     x, z = [low[0] - 0.03, high[0] + 0.03], [low[2] - 0.03, high[2] + 0.03]
     floor = np.array([[x[0], ground, z[0]], [x[1], ground, z[0]], [x[1], ground, z[1]], [x[0], ground, z[1]], [x[0], ground, z[0]]])
-    camera = fit_camera(np.concatenate([everything, floor]), azimuth=AZIMUTH, elevation=ELEVATION, aspect=PANEL_ASPECT)
-    return View(camera, _particle_radius(clouds[1]), float(low[1]), float(high[1]), floor)
+    fitted = fit_camera(np.concatenate([everything, floor]), azimuth=azimuth, elevation=elevation, aspect=PANEL_ASPECT)
+    return View(fitted, particle_spacing(clouds[1]), float(low[1]), float(high[1]), floor)
 
 
 def tool_surfaces(record: RunRecord, poses: Array, *, rows: int = 220, columns: int = 320) -> list[Array]:
@@ -126,7 +161,7 @@ def draw_scene(
 ) -> None:
     """Draw particles and tools on the floor into a matplotlib axis."""
     camera = view.camera
-    picture = render(camera, width=width, particles=particles, colours=colours, radius=view.radius, tools=tools, quality=quality)
+    picture = render(camera, width=width, particles=particles, colours=colours, spacing=view.spacing, tools=tools, quality=quality)
     floor = camera.project(view.floor)
     axis.fill(floor[:, 0], floor[:, 1], facecolor="#f1f0ec", edgecolor="#b9b6ad", linewidth=0.8, zorder=0)
     half_width, half_height = camera.half_width, camera.half_height
@@ -150,14 +185,15 @@ def _draw_directions(axis: Any, camera: Camera) -> None:
         axis.text(*(origin + 1.45 * direction), name, color="#555555", fontsize=8, ha="center", va="center", zorder=3)
 
 
-def _draw_panel(axis: Any, view: View, record: RunRecord, title: str, position: Any, pose: Any) -> None:
+def draw_panel(axis: Any, view: View, record: RunRecord, title: str, position: Any, pose: Any) -> None:
+    """Draw particles (N, 3), and tools at poses (M, 8) unless None, into an axis with a title."""
     particles = _numbers(position)
     tools = [] if pose is None else tool_surfaces(record, _numbers(pose))
     draw_scene(axis, view, particles, clay_colours(view, particles), tools, width=420)
     axis.set_title(title, fontsize=11)
 
 
-def _draw_priorities(figure: Any, axis: Any, view: View, record: RunRecord, stage: StageResult, pose: Any) -> None:
+def draw_priorities(figure: Any, axis: Any, view: View, record: RunRecord, stage: StageResult, pose: Any) -> None:
     """Panel of the transport priorities with the tools as placed."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
@@ -169,7 +205,7 @@ def _draw_priorities(figure: Any, axis: Any, view: View, record: RunRecord, stag
     mappable = ScalarMappable(norm, colormaps["viridis"])
     colours = mappable.to_rgba(priorities)[:, :3] if known else np.full((len(particles), 3), 0.7)
     draw_scene(axis, view, particles, np.asarray(colours), tool_surfaces(record, _numbers(pose)), width=420)
-    where = f" of stage {stage.index}" if len(record.stages) > 1 else ""
+    where = f" of stage {stage.index + 1}" if len(record.stages) > 1 else ""
     placed = "tool placed" if stage.best is not None else "no tool placed"
     axis.set_title(f"priorities{where}, {placed}" if known else f"{placed}{where} (the placer needs no priorities)", fontsize=11)
     if known:
@@ -192,15 +228,6 @@ def _add_height_bar(figure: Any, axes: NDArray[Any], view: View) -> None:
 def _shown_stage(record: RunRecord) -> StageResult:
     """The first stage whose plan was executed, else the first."""
     return next((stage for stage in record.stages if stage.best is not None), record.stages[0])
-
-
-def _particle_radius(positions: Array) -> float:
-    """Radius at which the balls of a cloud (N, 3) touch and close its surface, length units."""
-    from scipy.spatial import cKDTree
-
-    neighbours = min(8, len(positions))
-    distance, _ = cKDTree(positions).query(positions, k=neighbours)
-    return float(np.clip(0.95 * np.median(np.atleast_2d(distance)[:, -1]), 1e-3, 0.05))
 
 
 def _numbers(tensor: Any) -> Array:

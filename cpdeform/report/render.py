@@ -1,7 +1,7 @@
-"""A small renderer in numpy: clay as a shaded surface of particles, tools as solids, from one camera without perspective.
+"""A small renderer in numpy: clay as the surface of its density, tools as solids, from one camera without perspective.
 
-Particles are drawn as balls into a depth buffer, whose smoothed slope gives the shading: a groove a few particles deep is
-plain to see, where a scatter plot shows a cloud of dots.
+Points that cover the surfaces are drawn into a depth buffer. The clay's surface is that of `cpdeform.report.surface`, with its
+normals, so that a groove a few particles deep is plain to see, where a scatter plot shows a cloud of dots. Crumbs are balls.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cpdeform.report.clay import ClayPoints, clay_points
+
 Array = NDArray[np.float64]
 
 LIGHT = np.array([-0.55, 0.75, 0.35])
@@ -19,7 +21,12 @@ LIGHT = np.array([-0.55, 0.75, 0.35])
 
 TOOL_COLOUR = np.array([0.27, 0.42, 0.62])
 TOOL_OPACITY = 0.72
+HIDDEN_OPACITY = 0.2
+"""How much of a tool is seen through the clay in front of it."""
+
 INDEX_BITS = 24
+SKY = 0.02
+"""Width of the surroundings that a place may lie below, as a share of the picture's width."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,16 +88,23 @@ class _Layer:
 
 
 def render(
-    camera: Camera, *, width: int, particles: Array, colours: Array, radius: float, tools: Sequence[Array] = (), quality: int = 2
+    camera: Camera,
+    *,
+    width: int,
+    particles: Array,
+    colours: Array,
+    spacing: float | None = None,
+    tools: Sequence[Array] = (),
+    quality: int = 2,
 ) -> Array:
-    """Draw particles and tools.
+    """Draw clay and tools.
 
     Args:
         camera: From where.
         width: Width of the picture, pixels; its height follows from the camera.
         particles: Positions (N, 3), length units.
         colours: Colours (N, 3), in [0, 1].
-        radius: Radius of the balls that the particles are drawn as, length units.
+        spacing: Edge of the cube that a particle has to itself, length units; defaults to `particle_spacing` of the particles.
         tools: Surfaces (R, C, 3) from `cpdeform.report.shapes.tool_surface`.
         quality: Pixels are averages of `quality` x `quality` samples.
 
@@ -99,22 +113,41 @@ def render(
     """
     shape = (max(round(width * camera.half_height / camera.half_width), 1) * quality, width * quality)
     scale = 0.5 * shape[1] / camera.half_width
-    clay = _draw_points(camera, shape, particles, radius)
-    sigma = max(0.55 * radius * scale, 0.7)
-    colour, depth = _shade_clay(camera, clay, colours, sigma, scale)
-    opacity = clay.mask.astype(np.float64)
+    colour, depth = _draw_clay(camera, shape, clay_points(particles, colours, distance=1.0 / scale, spacing=spacing), scale)
+    covered = np.isfinite(depth)
+    opacity = covered.astype(np.float64)
     for tool in tools:
         layer = _draw_points(camera, shape, tool.reshape(-1, 3), 1.3 / scale)
         smooth = _fill(layer.depth, layer.mask, 1.0)
         shade = _lambert(camera, smooth, scale)[..., None]
         drawn = np.clip(TOOL_COLOUR * (0.45 + 0.7 * shade) + 0.25 * np.clip(shade, 0.0, 1.0) ** 12, 0.0, 1.0)
-        front = layer.mask & (~clay.mask | (layer.depth > depth))
-        share = np.where(front, TOOL_OPACITY, 0.0)
+        hidden = covered & (layer.depth <= depth)
+        share = np.where(layer.mask, np.where(hidden, HIDDEN_OPACITY, TOOL_OPACITY), 0.0)
         total = share + opacity * (1.0 - share)
         weight = np.divide(share, total, out=np.zeros_like(total), where=total > 0.0)[..., None]
         colour = weight * drawn + (1.0 - weight) * colour
         opacity = total
     return _average(colour, opacity, quality)
+
+
+def _draw_clay(camera: Camera, shape: tuple[int, int], clay: ClayPoints, scale: float) -> tuple[Array, Array]:
+    """Colours (H, W, 3) of clay and its depth (H, W), -inf where there is none."""
+    colour, depth = np.zeros((*shape, 3)), np.full(shape, -np.inf)
+    if len(clay.positions):
+        layer = _draw_points(camera, shape, clay.positions, 1.2 / scale)
+        shade = np.clip(clay.normals[layer.index] @ _light(), 0.0, 1.0)
+        # What lies deeper than its surroundings gets less of the sky's light.
+        around = SKY * shape[1]
+        sunken = np.clip((_fill(layer.depth, layer.mask, around) - layer.depth) * scale / (1.25 * around), 0.0, 1.0)
+        light = (0.42 + 0.68 * shade) * (1.0 - 0.4 * np.where(layer.mask, sunken, 0.0))
+        colour, depth = np.clip(clay.colours[layer.index] * light[..., None], 0.0, 1.0), layer.depth
+    if len(clay.crumbs):
+        layer = _draw_points(camera, shape, clay.crumbs, clay.crumb_radius)
+        shade = _lambert(camera, _fill(layer.depth, layer.mask, 0.7), scale)
+        front = layer.mask & (layer.depth > depth)
+        balls = np.clip(clay.crumb_colours[layer.index] * (0.42 + 0.68 * shade)[..., None], 0.0, 1.0)
+        colour, depth = np.where(front[..., None], balls, colour), np.where(front, layer.depth, depth)
+    return colour, depth
 
 
 def _draw_points(camera: Camera, shape: tuple[int, int], points: Array, radius: float) -> _Layer:
@@ -182,19 +215,12 @@ def _lambert(camera: Camera, depth: Array, scale: float) -> Array:
     down, right = np.gradient(depth * scale)
     normal = np.stack([-right, down, np.ones_like(depth)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    light = camera.axes @ (LIGHT / np.linalg.norm(LIGHT))
-    return np.asarray(np.clip(normal @ light, 0.0, 1.0))
+    return np.asarray(np.clip(normal @ (camera.axes @ _light()), 0.0, 1.0))
 
 
-def _shade_clay(camera: Camera, clay: _Layer, colours: Array, sigma: float, scale: float) -> tuple[Array, Array]:
-    """Colours (H, W, 3) of the clay and its smoothed depth (H, W)."""
-    smooth = _fill(clay.depth, clay.mask, sigma)
-    base = _fill(colours[clay.index], clay.mask, 0.7 * sigma)
-    shade = _lambert(camera, smooth, scale)
-    # What lies deeper than its surroundings gets less of the sky's light.
-    sunken = np.clip((_fill(clay.depth, clay.mask, 5.0 * sigma) - smooth) * scale / (6.0 * sigma), 0.0, 1.0)
-    light = (0.42 + 0.72 * shade) * (1.0 - 0.45 * sunken)
-    return np.clip(base * light[..., None], 0.0, 1.0), np.where(clay.mask, smooth, -np.inf)
+def _light() -> Array:
+    """Unit vector (3,) to the light in the world frame."""
+    return np.asarray(LIGHT / np.linalg.norm(LIGHT))
 
 
 def _average(colour: Array, opacity: Array, quality: int) -> Array:

@@ -8,7 +8,8 @@
     went on from, or null; its stages go on counting, so that the first file is that of the stage after the other record's
     last one.
 ``metrics.jsonl``
-    A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage.
+    A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage. ``time`` is in
+    seconds since the run began (since it was written, of one saved afterwards), ``gradient_norm`` that by the actions.
 ``.run.lock``
     Number of the process that writes, while it does.
 ``goal.h5``, ``stage-000.h5``, ...
@@ -21,7 +22,8 @@ import contextlib
 import datetime
 import errno
 import json
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -73,6 +75,7 @@ class RunRecorder(Observer):
         configuration: What defines the run, kept in the record.
         overwrite: Allow a directory that is not empty; files of an earlier record are then removed, others are left alone.
         resumed_from: The record that the run goes on from, to be named in this one.
+        origins: Where each value of the configuration comes from, see `cpdeform.run.origins`.
 
     Raises:
         InputError: The directory is not empty (without `overwrite`) or cannot be written, or another run is writing to it.
@@ -85,12 +88,15 @@ class RunRecorder(Observer):
         configuration: RunConfiguration | None = None,
         overwrite: bool = False,
         resumed_from: RunRecord | None = None,
+        origins: Mapping[str, str] | None = None,
     ) -> None:
         self.directory = Path(directory)
         self._configuration = configuration
         self._resumed_from = resumed_from
+        self._origins = origins
         self._overwrite = overwrite
         self._run: dict[str, Any] = {}
+        self._begun = time.perf_counter()
         self._batch: dict[int, int] = {}
         self._rescued = False
         check_directory(self.directory, overwrite=overwrite)
@@ -115,6 +121,7 @@ class RunRecorder(Observer):
     def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
         """Begin the record: everything that is known before the first stage."""
         check_directory(self.directory, overwrite=self._overwrite)
+        self._begun = time.perf_counter()
         with self._writing():
             self.directory.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
@@ -134,6 +141,7 @@ class RunRecorder(Observer):
                 "recorded_at": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
                 **environment(),
                 "configuration": self._configuration.model_dump(mode="json") if self._configuration else None,
+                "origins": None if self._origins is None else dict(self._origins),
                 # The goal is the copy beside this file.
                 "task": {**task.model_dump(mode="json"), "goal": GOAL_FILE},
             }
@@ -169,6 +177,7 @@ class RunRecorder(Observer):
                 "iteration": iteration.index,
                 "loss": iteration.loss,
                 "best_loss": iteration.best_loss,
+                "gradient_norm": iteration.gradient_norm,
                 "seconds": iteration.seconds,
             }
         )
@@ -242,6 +251,7 @@ class RunRecorder(Observer):
 
     def _append(self, line: dict[str, Any]) -> None:
         """Append a line to the metrics; the file is closed at once, so that the line outlives this process."""
+        line = {**line, "time": round(time.perf_counter() - self._begun, 3)}
         with self._writing(), (self.directory / METRICS_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(to_json(line), allow_nan=False) + "\n")
 
@@ -281,6 +291,7 @@ def save_result(
     configuration: RunConfiguration | None = None,
     overwrite: bool = False,
     resumed_from: RunRecord | None = None,
+    origins: Mapping[str, str] | None = None,
 ) -> Path:
     """Write the record of a run that is over, the same as `RunRecorder` writes during one.
 
@@ -290,6 +301,7 @@ def save_result(
         configuration: What defined the run, kept in the record.
         overwrite: As for `RunRecorder`.
         resumed_from: The record that the run went on from.
+        origins: As for `RunRecorder`.
 
     Returns:
         The directory.
@@ -298,7 +310,7 @@ def save_result(
         InputError: The directory is not empty (without `overwrite`) or cannot be written.
         RecordError: Writing failed on the way, e.g. because the disk is full.
     """
-    recorder = RunRecorder(directory, configuration=configuration, overwrite=overwrite, resumed_from=resumed_from)
+    recorder = RunRecorder(directory, configuration=configuration, overwrite=overwrite, resumed_from=resumed_from, origins=origins)
     recorder.run_started(result.task, result.goal, result.names, result.seed)
     for stage in result.stages:
         for iteration in stage.history:

@@ -27,7 +27,8 @@ OLD_GOAL_FILE = "target.h5"
 """What it was called up to format 2."""
 
 STAGE_PATTERN = re.compile(r"stage-(\d{3,})\.h5")
-OWN_FILES = (RUN_FILE, METRICS_FILE, GOAL_FILE, OLD_GOAL_FILE, "picture.png", "animation.mp4", "animation.gif")
+PICTURE_FILES = ("picture.png", "sheet.png", "curves.png", "animation.mp4", "animation.gif", "report.html")
+OWN_FILES = (RUN_FILE, METRICS_FILE, GOAL_FILE, OLD_GOAL_FILE, *PICTURE_FILES)
 """Files, besides the stages', that `overwrite` may remove; pictures are among them since they would show the old run."""
 
 PACKAGES = ("cpdeform", "torch", "warp-lang", "taichi", "pot", "geomloss", "numpy", "h5py")

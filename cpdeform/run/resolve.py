@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cpdeform.core.errors import InputError
+from cpdeform.core.errors import InputError, PluginError
 from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.machine import available_cores
 from cpdeform.core.objective import Objective
@@ -31,6 +31,7 @@ from cpdeform.planning.strategy import Parts, Strategy
 from cpdeform.run.checks.check import warn_about_tools
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.hook_observer import HookObserver
+from cpdeform.run.origins import Origin, trace_origins
 from cpdeform.run.parts import (
     make_objective,
     make_optimizer,
@@ -84,6 +85,7 @@ class ResolvedRun:
         state: Where to start, a single world; None for the scene's start.
         first_stage: Number of the first stage.
         previous: The stages before it.
+        origins: Where each value of the configuration comes from, see `cpdeform.run.origins`.
     """
 
     configuration: RunConfiguration
@@ -95,6 +97,7 @@ class ResolvedRun:
     state: State | None = None
     first_stage: int = 0
     previous: tuple[StageResult, ...] = ()
+    origins: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def names(self) -> dict[str, str]:
@@ -189,7 +192,7 @@ class ResolvedRun:
                 stages=self.configuration.stages, state=self.state, first_stage=self.first_stage, previous=self.previous
             )
         fields = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
-        return RunResult(**fields, configuration=self.configuration, resumed_from=self.record)
+        return RunResult(**fields, configuration=self.configuration, resumed_from=self.record, origins=self.origins)
 
 
 def resolve(
@@ -223,10 +226,12 @@ def resolve(
     objects = objects or PartObjects()
     values = given.model_dump(exclude_unset=True) if isinstance(given, RunConfiguration) else current_options(dict(given))
     asked = validate(RunConfiguration, values, source="configuration")
+    layers: list[tuple[Origin, Mapping[str, Any]]] = [(Origin.GIVEN, values)]
     if record is not None:
         if task is not None or "task" in values:
             check_same_task(record, task if task is not None else load_task(asked.task, registry=registry))
         values = resumed_values(record, values)
+        layers.append((Origin.RECORD, values))
         asked = validate(RunConfiguration, values, source="configuration")
     _check_names(asked, objects, registry=registry)
     strategy = objects.strategy or registry.create("strategy", asked.strategy, **asked.strategy_options)
@@ -237,16 +242,9 @@ def resolve(
         task = changed_task(resumed_task(record), scene=asked.scene)
     settings = strategy.settings(task, placer=values.get("placer"))
     configuration = validate(RunConfiguration, merge(settings, values), source=f"strategy {asked.strategy}: settings")
-    device = configuration.device
-    configuration = configuration.model_copy(
-        update={
-            "task": configuration.task if configuration.task.endswith((".yaml", ".yml")) else task.name,
-            "backend": registry.resolve("simulator", configuration.backend, device=device)
-            if objects.simulator is None
-            else configuration.backend,
-            "ot": registry.resolve("ot_solver", configuration.ot, device=device) if objects.ot_solver is None else configuration.ot,
-        }
-    )
+    layers.append((Origin.STRATEGY, settings))
+    task_name = configuration.task if configuration.task.endswith((".yaml", ".yml")) else task.name
+    configuration = configuration.model_copy(update={"task": task_name, **_chosen_parts(configuration, objects, registry=registry)})
     return ResolvedRun(
         configuration=configuration,
         task=task,
@@ -257,7 +255,44 @@ def resolve(
         state=state if record is None else record.state,
         first_stage=first_stage if record is None else record.next_stage,
         previous=() if record is None else record.stages,
+        origins=_origins(configuration, layers, asked, objects),
     )
+
+
+def _origins(
+    configuration: RunConfiguration,
+    layers: Sequence[tuple[Origin, Mapping[str, Any]]],
+    asked: RunConfiguration,
+    objects: PartObjects,
+) -> dict[str, str]:
+    """Where each value comes from; names that "auto" or an object stands for, too."""
+    origins = trace_origins(configuration.model_dump(mode="json"), layers)
+    origins |= {name: Origin.AUTO.value for name in ("backend", "ot") if getattr(asked, name) == AUTO}
+    parts = {
+        "backend": objects.simulator,
+        "ot": objects.ot_solver,
+        "placer": objects.placer,
+        "strategy": objects.strategy,
+        "objective.kind": objects.objective,
+    }
+    return origins | {name: Origin.OBJECT.value for name, part in parts.items() if part is not None}
+
+
+def _chosen_parts(configuration: RunConfiguration, objects: PartObjects, *, registry: Registry) -> dict[str, str]:
+    """Names of the simulator and of the transport solver, chosen where they are "auto"; all that is missing is told at once."""
+    chosen, missing = {}, []
+    for field, kind, part in (("backend", "simulator", objects.simulator), ("ot", "ot_solver", objects.ot_solver)):
+        name = getattr(configuration, field)
+        try:
+            chosen[field] = name if part is not None else registry.resolve(kind, name, device=configuration.device)
+        except PluginError as error:
+            missing.append(error)
+    if len(missing) > 1:
+        remedy = 'pip install "cpdeform[all]" brings all of them.'
+        raise PluginError(f"{' '.join(map(str, missing))} {remedy}") from missing[0]
+    if missing:
+        raise missing[0]
+    return chosen
 
 
 def _check_names(configuration: RunConfiguration, objects: PartObjects, *, registry: Registry) -> None:

@@ -55,7 +55,7 @@ def record_run(resolved: ResolvedRun, directory: Path, observers: Sequence[Obser
         return
     earlier = _earlier(directory, resolved)
     if earlier is None:
-        with RunRecorder(directory, configuration=resolved.configuration, overwrite=True) as recorder:
+        with RunRecorder(directory, configuration=resolved.configuration, overwrite=True, origins=resolved.origins) as recorder:
             resolved.run([recorder, *observers])
     else:
         with RunContinuer(earlier) as recorder:

@@ -19,6 +19,7 @@ from cpdeform.core.task import Task, list_variants, load_task, task_path
 from cpdeform.report.pictures import View, clay_colours, draw_scene
 from cpdeform.report.render import fit_camera
 from cpdeform.report.shapes import tool_surface
+from cpdeform.report.surface import particle_spacing
 
 Array = NDArray[np.float64]
 
@@ -97,7 +98,7 @@ def _draw_pair(upper: Any, lower: Any, task: Task, *, width: int) -> None:
     view = _make_view(task, start, goal, tools)
     draw_scene(upper, view, start, clay_colours(view, start), tools, width=width)
     upper.set_title(f"{task.name}: start", fontsize=7, pad=1.5)
-    view = dataclasses.replace(view, radius=_particle_radius(goal))
+    view = dataclasses.replace(view, spacing=particle_spacing(goal))
     draw_scene(lower, view, goal, clay_colours(view, goal), [], width=width)
     lower.set_title("goal", fontsize=7, pad=1.5)
 
@@ -111,15 +112,7 @@ def _make_view(task: Task, start: Array, goal: Array, tools: list[Array]) -> Vie
     azimuth, elevation = DIRECTIONS.get(task.name, DIRECTION)
     everything = np.concatenate([clay, floor, *(surface.reshape(-1, 3) for surface in tools)])
     camera = fit_camera(everything, azimuth=azimuth, elevation=elevation, aspect=PANEL_ASPECT, margin=0.03)
-    return View(camera, _particle_radius(start), float(low[1]), float(high[1]), floor)
-
-
-def _particle_radius(positions: Array) -> float:
-    """Radius at which the balls of a cloud (N, 3) touch and close its surface, length units."""
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(positions).query(positions, k=8)
-    return float(np.clip(0.95 * np.median(distance[:, -1]), 1e-3, 0.05))
+    return View(camera, particle_spacing(start), float(low[1]), float(high[1]), floor)
 
 
 def _save(canvas: Any, path: Path) -> None:

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import builtins
 import gc
+import sys
 
 import imageio.v2
 import numpy as np
 import pytest
 import torch
 
+import cpdeform
 from cpdeform.core.errors import InputError
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.scene import (
@@ -19,14 +21,14 @@ from cpdeform.core.scene import (
     ToolTorus,
 )
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.report import draw_run
 from cpdeform.report.animation import draw_animation
+from cpdeform.report.draw import draw_chosen
 from cpdeform.report.pictures import draw_picture
 from cpdeform.report.render import fit_camera, render
 from cpdeform.report.shapes import tool_surface
 from cpdeform.run.deform import deform
-from cpdeform.run.record import RunRecorder, load_record
+from cpdeform.run.record import load_record
 
 TOOLS = [
     ToolSphere(position=(0, 0, 0), radius=0.1),
@@ -37,19 +39,6 @@ TOOLS = [
     ToolTorus(position=(0, 0, 0), major_radius=0.1, tube_radius=0.03),
     ToolChopsticks(position=(0, 0, 0), radius=0.03, height=0.2, gap=0.1),
 ]
-
-
-@pytest.fixture
-def record(tmp_path, toy_task_file, toy_entry_points):
-    def make(**options):
-        registry = load_registry(toy_entry_points)
-        parts = {"simulator": "toy", "ot_solver": "toy", "placer": "toy", **options}
-        recorder = RunRecorder(tmp_path / "run")
-        optimizer = TrajectoryOptimizer(iterations=3)
-        deform(str(toy_task_file), registry=registry, optimizer=optimizer, observers=[recorder], **parts)
-        return recorder.directory
-
-    return make
 
 
 @pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.kind)
@@ -84,18 +73,37 @@ def volume(tool):
     return x * y * z + 2 * r * (x * y + y * z + z * x) + np.pi * r**2 * (x + y + z) + 4 / 3 * np.pi * r**3
 
 
+def ball(centre, radius, count=400, seed=0):
+    points = np.random.default_rng(seed).uniform(-1.0, 1.0, (4 * count, 3))
+    return np.asarray(centre) + radius * points[np.linalg.norm(points, axis=1) < 1.0][:count]
+
+
 def test_the_nearer_thing_hides_the_farther():
-    particles = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    colours = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    """Of two balls of clay in a line the nearer one is seen, as of two crumbs; beside them there is nothing."""
     camera = fit_camera(np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), azimuth=0.0, elevation=0.0, aspect=1.0)
-    picture = render(camera, width=41, particles=particles, colours=colours, radius=0.3)
-    assert picture.shape == (41, 41, 4)
-    red, green, _, opacity = picture[20, 20]
-    assert green > 0.2 > red
-    assert opacity == 1.0
-    assert picture[0, 0, 3] == 0.0
-    behind = render(camera, width=41, particles=particles[::-1], colours=colours, radius=0.3)
-    assert behind[20, 20, 0] > 0.2
+    balls = np.concatenate([ball((0.0, 0.0, 0.0), 0.3), ball((0.0, 0.0, 0.9), 0.3)])
+    for particles in (balls, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])):
+        half = len(particles) // 2
+        colours = np.repeat([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [half, len(particles) - half], axis=0)
+        for order in (slice(None), slice(None, None, -1)):
+            picture = render(camera, width=41, particles=particles[order], colours=colours[order], spacing=0.07)
+            assert picture.shape == (41, 41, 4)
+            red, green, _, opacity = picture[20, 20]
+            assert green > 0.2 > red
+            assert opacity == 1.0
+            assert picture[0, 0, 3] == 0.0
+
+
+def test_a_tool_behind_clay_is_seen_through_it():
+    camera = fit_camera(np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), azimuth=0.0, elevation=0.0, aspect=1.0)
+    particles = ball((0.0, 0.0, 0.5), 0.3)
+    pose = np.array([0.0, 0.0, -0.5, 1.0, 0.0, 0.0, 0.0, 0.0])
+    tool = tool_surface(ToolSphere(position=(0, 0, 0), radius=0.1), pose)
+    options = {"width": 61, "particles": particles, "colours": np.tile([1.0, 0.5, 0.2], (len(particles), 1))}
+    without, behind = (render(camera, **options, tools=tools)[30, 30] for tools in ((), (tool,)))
+    in_front = render(camera, **options, tools=(tool + np.array([0.0, 0.0, 2.0]),))[30, 30]
+    assert without[0] > behind[0] > in_front[0]
+    assert without[2] < behind[2] < in_front[2]
 
 
 def panels(path):
@@ -121,9 +129,9 @@ def test_picture_and_animation(record):
         frames = list(reader.iter_data())
     del reader
     gc.collect()
-    # 2 stages of 5 steps, start included, and the last one held.
-    assert len(frames) == 18
-    assert np.abs(frames[0].astype(float) - frames[10]).mean() > 0.5
+    # 2 stages of 5 steps with two frames between them, the start included, and the last one held for a second.
+    assert len(frames) == 2 * (5 * 3 + 1) + 18
+    assert np.abs(frames[0].astype(float) - frames[30]).mean() > 0.5
     assert {path.name for path in directory.iterdir() if path.name.startswith(".")} == set()
 
 
@@ -150,10 +158,56 @@ def test_no_priorities_and_no_executed_plan(record, tmp_path):
 
 def test_gif_without_ffmpeg(record, monkeypatch):
     monkeypatch.setattr("cpdeform.report.animation._has_ffmpeg", lambda: False)
+    monkeypatch.setattr("cpdeform.report.animation.MOST_BETWEEN", 1)
     directory = record(stages=1)
     path = draw_animation(load_record(directory))
     assert path == directory / "animation.gif"
     assert len(imageio.v2.mimread(path)) >= 6
+
+
+def test_sheet_and_curves(record, tmp_path):
+    directory = record()
+    picture, curves, sheet = draw_chosen(directory, ("picture", "curves", "sheet"), camera="top")
+    assert [path.name for path in (picture, curves, sheet)] == ["picture.png", "curves.png", "sheet.png"]
+    rows = np.array_split(imageio.v2.imread(sheet)[..., :3].astype(float), 2)
+    assert all(row.std() > 10.0 for row in rows)
+    assert imageio.v2.imread(curves).std() > 10.0
+    for camera in ("sideways", (1.0, 2.0, 3.0), (0.0, 120.0), "nan,1"):
+        with pytest.raises(InputError, match="camera"):
+            draw_chosen(directory, ("picture",), camera=camera)
+
+
+def test_public_render(record):
+    """Clay from above is wider than from the front; tools are drawn where a scene says what they are."""
+    recorded = load_record(record(stages=1))
+    state, scene = recorded.state, recorded.task.scene
+    plain = cpdeform.render(state, width=120)
+    assert plain.dtype == np.uint8
+    assert plain.shape[1:] == (120, 3)
+    assert (plain[0] == 255).all()
+    blue = cpdeform.render(state, scene=scene, width=120).astype(int)
+    assert (blue[..., 2] > blue[..., 0] + 20).any()
+    assert not (plain[..., 2].astype(int) > plain[..., 0].astype(int) + 20).any()
+    board = np.random.default_rng(0).uniform(0.0, 1.0, (3000, 3)) * [1.0, 0.1, 1.0]
+    shares = [(cpdeform.render(board, camera=camera, width=120) < 250).any(axis=-1).mean() for camera in ("top", "front")]
+    assert shares[0] > 2.0 * shares[1]
+    for wrong in ({"values": np.zeros(3)}, {"width": 0}, {"camera": "nowhere"}):
+        with pytest.raises(InputError):
+            cpdeform.render(state, **wrong)
+    for nothing in (state.fork(2), np.zeros((0, 3)), np.full((4, 3), np.nan)):
+        with pytest.raises(InputError, match="state"):
+            cpdeform.render(nothing)
+
+
+def test_a_result_shows_itself(toy_task_file, toy_entry_points, monkeypatch):
+    result = deform(
+        str(toy_task_file), simulator="toy", ot_solver="toy", placer="toy", registry=load_registry(toy_entry_points), stages=1
+    )
+    text = result._repr_html_()
+    assert text.count("data:image/png;base64,") == 3
+    assert f"{result.loss_final:.4g}" in text
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert "data:image" not in result._repr_html_()
 
 
 def test_no_pyplot(record, monkeypatch):
