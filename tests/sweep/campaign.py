@@ -26,7 +26,7 @@ from cpdeform.sweep.status import sweep_status
 from cpdeform.sweep.worker import Worker
 
 STAGES = 3
-TIMES = frozenset({"seconds", "recorded_at", "memory", "rollout", "objective", "vjp", "optimizer"})
+TIMES = frozenset({"seconds", "time", "recorded_at", "memory", "rollout", "objective", "vjp", "optimizer"})
 """Fields of a record that no two runs have in common."""
 
 SECONDS_TO_WAIT = 600.0
