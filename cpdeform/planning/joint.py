@@ -13,7 +13,6 @@ from cpdeform.core.placer import Candidate
 from cpdeform.core.state import State
 from cpdeform.planning.algorithm import Planner
 from cpdeform.planning.chain import SimulatorChain, begin_stage
-from cpdeform.planning.coarse import CoarsePlanner
 from cpdeform.planning.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
 from cpdeform.planning.result import StageResult
 from cpdeform.planning.workbench import is_finite
@@ -25,9 +24,6 @@ def polish_jointly(
     planner: Planner,
     results: Sequence[StageResult],
     optimizer: TrajectoryOptimizer,
-    *,
-    coarse: CoarsePlanner | None = None,
-    coarse_optimizer: TrajectoryOptimizer | None = None,
 ) -> list[StageResult]:
     """Lower the loss at the end of several stages over the actions of all of them, and execute them anew.
 
@@ -38,8 +34,6 @@ def polish_jointly(
         planner: The parts.
         results: Consecutive stages; those without a plan stay as they are.
         optimizer: How.
-        coarse: Descends with fewer particles first; None for none.
-        coarse_optimizer: How; defaults to `optimizer`.
 
     Returns:
         The stages with their new plans; those given where nothing is gained.
@@ -49,30 +43,19 @@ def polish_jointly(
         return list(results)
     begun = time.perf_counter()
     actions = torch.cat([result.actions for result in planned if result.actions is not None]).unsqueeze(0)
-    spent: list[OptimizationResult] = []
-    if coarse is not None:
-        begin = coarse.model.thinned(planned[0].state_before)
-        spent.append(_minimize(coarse.coarse, begin, planned, actions, coarse_optimizer or optimizer, warm=None))
-        actions = spent[0].actions.to(actions)
-    spent.append(_minimize(planner, planned[0].state_before, planned, actions, optimizer, warm=planned[-1].warm))
-    executed = _execute(planner, planned, spent[-1])
+    found = _minimize(planner, planned, actions, optimizer)
+    executed = _execute(planner, planned, found)
     if executed is None or not executed[-1].loss < planned[-1].loss:
         executed = planned
     seconds = (time.perf_counter() - begun) / len(planned)
-    polished = iter([_accounted(result, seconds, spent, last=result is executed[-1]) for result in executed])
+    polished = iter([_accounted(result, seconds, found, last=result is executed[-1]) for result in executed])
     return [result if result.actions is None else next(polished) for result in results]
 
 
 def _minimize(
-    planner: Planner,
-    state: State,
-    planned: Sequence[StageResult],
-    actions: torch.Tensor,
-    optimizer: TrajectoryOptimizer,
-    *,
-    warm: tuple[object, ...] | None,
+    planner: Planner, planned: Sequence[StageResult], actions: torch.Tensor, optimizer: TrajectoryOptimizer
 ) -> OptimizationResult:
-    """The descent from a state, told to the observers as iterations of the last stage."""
+    """The descent, told to the observers as iterations of the last stage."""
     poses = torch.stack([_executed(result).proposal.pose for result in planned])
     chain = SimulatorChain(planner.simulator, poses=poses, rest_steps=planner.task.rest_steps)
     check_memory(chain, step_count=actions.shape[1], worlds=1)
@@ -81,7 +64,15 @@ def _minimize(
         for observer in planner.observers:
             observer.iteration_finished(planned[-1].index, dataclasses.replace(iteration, phase=PHASE))
 
-    return optimizer.minimize(chain, state, actions, planner.objective, warm=warm, executor=planner.executor, on_iteration=tell)
+    return optimizer.minimize(
+        chain,
+        planned[0].state_before,
+        actions,
+        planner.objective,
+        warm=planned[-1].warm,
+        executor=planner.executor,
+        on_iteration=tell,
+    )
 
 
 def _execute(planner: Planner, planned: Sequence[StageResult], found: OptimizationResult) -> list[StageResult] | None:
@@ -126,12 +117,12 @@ def _executed(result: StageResult) -> Candidate:
     return result.candidates[result.best]
 
 
-def _accounted(result: StageResult, seconds: float, spent: Sequence[OptimizationResult], *, last: bool) -> StageResult:
+def _accounted(result: StageResult, seconds: float, found: OptimizationResult, *, last: bool) -> StageResult:
     """A stage with its share of what the joint polish took; the last stage keeps its iterations."""
-    iterations = [iteration for found in spent for iteration in found.history] if last else []
+    iterations = [dataclasses.replace(iteration, phase=PHASE) for iteration in found.history] if last else []
     return dataclasses.replace(
         result,
-        gradient_evaluations=result.gradient_evaluations + sum(found.gradient_evaluations for found in spent),
-        history=(*result.history, *(dataclasses.replace(iteration, phase=PHASE) for iteration in iterations)),
+        gradient_evaluations=result.gradient_evaluations + found.gradient_evaluations,
+        history=(*result.history, *iterations),
         seconds={**result.seconds, PHASE: seconds, "total": result.seconds.get("total", 0.0) + seconds},
     )

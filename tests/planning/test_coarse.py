@@ -1,36 +1,31 @@
-"""Stages that are planned with fewer particles and executed with all, on the toy simulator."""
+"""Touches that are screened with fewer particles, on the toy simulator."""
 
 from __future__ import annotations
-
-import dataclasses
 
 import numpy as np
 import pytest
 import torch
-from cpdeform_toy.parts import OTSolverToy, PlacerToy
+from cpdeform_toy.parts import OTSolverToy
 from cpdeform_toy.simulator import SimulatorToy
 
 from cpdeform.core.goal import write_goal
+from cpdeform.core.placer import Candidate, Proposal, Stage
 from cpdeform.core.sampling import sample_particles
 from cpdeform.core.task import load_task
-from cpdeform.planning.algorithm import Planner, Start
-from cpdeform.planning.coarse import PARTICLES_PER_CELL, CoarseModel, CoarsePlanner, coarsening
-from cpdeform.planning.interrupted import StageInterrupted
+from cpdeform.planning.coarse import PARTICLES_PER_CELL, CoarseModel, coarsening
 from cpdeform.planning.objectives.shape import ObjectiveShape
 from cpdeform.planning.objectives.transport import ObjectiveTransport
-from cpdeform.planning.optimizer import TrajectoryOptimizer
-from cpdeform.planning.phases.descent import PhaseDescent
-from cpdeform.planning.pruner import PrunerNone
-from cpdeform.planning.result import Observer, Status
+from cpdeform.planning.result import Status
+from cpdeform.planning.still import still_trajectory
+from cpdeform.planning.strategies.sculpt import StrategySculpt
+from cpdeform.planning.workbench import Workbench
+from cpdeform.run.deform import deform
 
 BODY = {"kind": "box", "position": [0.4, 0.2, 0.5], "widths": [0.1, 0.1, 0.1], "particle_count": 900}
 SCENE = {
     "bodies": [BODY, {**BODY, "position": [0.4, 0.4, 0.5], "particle_count": 901}],
     "tools": [{"kind": "Sphere", "radius": 0.05, "position": [0.25, 0.3, 0.5], "action_scale": [0.01, 0.01, 0.01]}],
 }
-
-
-POLISH = TrajectoryOptimizer(iterations=2, learning_rate=0.05, pruner=PrunerNone())
 
 
 @pytest.fixture
@@ -40,29 +35,15 @@ def task(make_toy_task):
     return task
 
 
-def planner(task, **options):
+def objective_of(task):
     goal, start = torch.as_tensor(task.load_goal()), torch.as_tensor(sample_particles(task.scene))
     transport = ObjectiveTransport(OTSolverToy(), goal, scene=task.scene)
-    return Planner(
-        task=task,
-        simulator=SimulatorToy(task.scene, batch_size=4),
-        ot_solver=OTSolverToy(),
-        placer=PlacerToy(),
-        objective=ObjectiveShape(transport, task.scene, goal, start),
-        phases=(PhaseDescent(optimizer=TrajectoryOptimizer(iterations=4, pruner=PrunerNone())),),
-        **options,
-    )
-
-
-def beginning(parts):
-    state = parts.simulator.initial_state(batch_size=1)
-    goal = torch.as_tensor(parts.task.load_goal()).to(state.position)
-    return Start(state=state, goal=goal, first_stage=0, stages=2)
+    return ObjectiveShape(transport, task.scene, goal, start)
 
 
 def test_every_second_particle_of_each_body_is_kept(task):
     simulator = SimulatorToy(task.scene, batch_size=3)
-    model = CoarseModel.of(simulator)
+    model = CoarseModel.of(simulator, objective_of(task))
     assert coarsening(task.scene) == 2
     assert [body.particle_count for body in model.simulator.scene.bodies] == [450, 451]
     assert torch.equal(model.kept, torch.cat([torch.arange(0, 900, 2), torch.arange(900, 1801, 2)]))
@@ -80,41 +61,52 @@ def test_few_particles_are_not_thinned_out(task):
     bodies = tuple(body.model_copy(update={"particle_count": 400}) for body in task.scene.bodies)
     few = task.scene.model_copy(update={"bodies": bodies})
     assert 400 / (0.001 * 64**3) / PARTICLES_PER_CELL < 1.5
-    assert CoarseModel.of(SimulatorToy(few)) is None
-    parts = dataclasses.replace(planner(task), objective=ObjectiveTransport(OTSolverToy(), torch.as_tensor(task.load_goal())))
-    assert CoarsePlanner.of(parts, beginning(parts), polish=POLISH) is None
+    assert CoarseModel.of(SimulatorToy(few), objective_of(task)) is None
 
 
-def test_a_stage_is_executed_with_all_particles(task):
-    parts = planner(task)
-    start = beginning(parts)
-    result = CoarsePlanner.of(parts, start, polish=POLISH).stage(0, start.state)
-    assert result.status is Status.FINISHED
-    assert result.state.position.shape == start.state.position.shape
-    assert result.priorities.shape == (1801,)
-    best = result.candidates[result.best]
-    again = parts.simulator.rollout(start.state.with_tools(best.proposal.pose[None]), best.actions[None])
-    assert torch.equal(again.final_state.position, result.state.position)
-    assert result.loss == best.loss == pytest.approx(float(parts.objective.evaluate(again).loss[0]))
-    assert result.loss < 0.9 * result.loss_before
-    contacts = [candidate.proposal.contact_particle for candidate in result.candidates]
-    assert all(contact in CoarseModel.of(parts.simulator).kept.tolist() for contact in contacts if contact is not None)
+class Counting(SimulatorToy):
+    """Notes the particles of each rollout."""
+
+    def __init__(self, scene, **options):
+        super().__init__(scene, **options)
+        Counting.seen = getattr(Counting, "seen", [])
+
+    def rollout(self, state, actions):
+        Counting.seen.append((state.batch_size, state.particle_count))
+        return super().rollout(state, actions)
 
 
-class Interrupt(Observer):
-    """Control-C after an iteration."""
+def test_touches_are_screened_coarsely_and_executed_with_all_particles(task):
+    Counting.seen = []
+    parts = {"simulator": Counting(task.scene, batch_size=4), "ot_solver": OTSolverToy()}
+    strategy = StrategySculpt(touches=6, variations=3, iterations=(1, 1), polished=(2, 1), together=1)
+    settings = {"objective": {"points": None}}
+    result = deform(task, strategy=strategy, settings=settings, stages=1, **parts, seed=1)
+    (stage,) = result.stages
+    assert stage.status is Status.FINISHED
+    thin = sum(worlds for worlds, particles in Counting.seen if particles == 901)
+    # Six touches and two rounds of three, all with half of the particles; the execution is the one rollout with all.
+    assert (thin, stage.rollouts) == (len(stage.candidates), len(stage.candidates) + 1)
+    assert stage.positions.shape[1] == 1801
+    # Only plans that were polished with all particles are in the race.
+    assert sum(np.isfinite(candidate.loss) for candidate in stage.candidates) <= 2
+    Counting.seen = []
+    deform(task, strategy=StrategySculpt(touches=6, coarse=False, together=1), settings=settings, stages=1, **parts, seed=1)
+    assert all(particles == 1801 for _, particles in Counting.seen)
 
-    def iteration_finished(self, stage, iteration):
-        if iteration.index == 2:
-            raise KeyboardInterrupt
 
-
-def test_an_interrupted_stage_keeps_its_best_plan_with_all_particles(task):
-    parts = planner(task, observers=(Interrupt(),))
-    start = beginning(parts)
-    with pytest.raises(StageInterrupted) as caught:
-        CoarsePlanner.of(parts, start, polish=POLISH).stage(0, start.state)
-    result = caught.value.result
-    assert result.status is Status.INTERRUPTED
-    assert result.positions.shape[1] == 1801
-    assert result.loss < result.loss_before
+def test_coarse_losses_start_from_the_loss_of_the_state(task):
+    """A touch that moves nothing has the state's own loss; one that moves all alike changes the loss as with all particles."""
+    simulator, objective = SimulatorToy(task.scene, batch_size=4), objective_of(task)
+    state = simulator.initial_state(batch_size=1)
+    loss = float(objective.evaluate(still_trajectory(state, 5, scene=task.scene)).loss[0])
+    stage = Stage(0, task.scene, state, objective.goal, None, torch.Generator(), loss=loss, step_count=5)
+    bench = Workbench(stage=stage, task=task, simulator=simulator, objective=objective)
+    plans = [torch.zeros(5, 3), torch.tensor([0.5, 0.0, 0.0]).repeat(5, 1)]
+    candidates = [Candidate(Proposal(state.tool_pose[0], 0.0, "way", None), float("nan"), plan) for plan in plans]
+    found = CoarseModel.of(simulator, objective).rollout_losses(bench, candidates, phase="screening")
+    assert bench.rollouts == 2
+    assert float(found[0]) == pytest.approx(loss, rel=1e-9)
+    whole = bench.rollout_losses(candidates, None, phase="screening")
+    assert float(found[1] - found[0]) == pytest.approx(float(whole[1] - whole[0]), rel=0.2)
+    assert float(found[1]) < float(found[0])

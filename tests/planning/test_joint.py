@@ -121,7 +121,7 @@ class Interrupt(Observer):
 
 
 def sculpted(task, *, simulator=SimulatorChained, **options):
-    strategy = StrategySculpt(touches=8, variations=4, iterations=(1, 1), together=2, joint_iterations=(5, 5))
+    strategy = StrategySculpt(touches=8, variations=4, iterations=(1, 1), together=2, joint_iterations=5)
     parts = {"simulator": simulator(task.scene, batch_size=4), "ot_solver": OTSolverToy()}
     return deform(task, strategy=strategy, settings={"objective": {"points": None}}, **parts, seed=1, **options)
 

@@ -26,6 +26,7 @@ class ObjectiveShape(Objective):
     node's neighbours, hence the coarser grids. The loss is 1 + `density_weight` at the start and 0 for the goal itself.
 
     Attributes:
+        goal: Goal particles (M, 3), length units.
         start: Particles (N, 3) where the run begins, length units.
 
     Args:
@@ -45,7 +46,7 @@ class ObjectiveShape(Objective):
         if not 0.0 <= density_weight < float("inf"):
             raise InputError("density_weight", came=str(density_weight), expected="a finite number of at least 0")
         self._transport, self._weight, self._scene = transport, density_weight, scene
-        self.start = start.detach()
+        self.goal, self.start = goal.detach(), start.detach()
         self._scenes = [scene.model_copy(update={"grid_size": nodes}) for nodes in SCALES]
         self._goals = [_shares(goal.detach(), scale) for scale in self._scenes]
         cost = float(transport.value(start.detach()))

@@ -19,11 +19,12 @@ MOST_ALIKE = 2
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhasePolish(Phase):
-    """Go on from the plans of the best candidates by gradient descent; the others stay as they are.
+    """Go on from the plans of the best candidates by gradient descent; the others stay as they are, or leave the race.
 
     Attributes:
         keep: Number of candidates that are polished.
         optimizer: How.
+        exclusive: Whether the others get an infinite loss: where their losses are estimates, no plan should be chosen by them.
         name: The phase's name.
 
     Raises:
@@ -33,6 +34,7 @@ class PhasePolish(Phase):
     scope: ClassVar[Scope] = "search"
     keep: int
     optimizer: TrajectoryOptimizer
+    exclusive: bool = False
     name: str = "polish"
 
     def __post_init__(self) -> None:
@@ -40,14 +42,16 @@ class PhasePolish(Phase):
             raise InputError("keep", came=str(self.keep), expected="at least 1")
 
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
-        """All candidates, the best of them with better plans; a plan is never worse than before."""
+        """All candidates, the best of them with better plans; unless `exclusive`, a plan is never worse than before."""
         chosen = self._best(candidates)
         if not chosen:
             return candidates
         found = bench.minimize([candidates[number] for number in chosen], self.optimizer, None, phase=self.name)
         result = list(candidates)
+        if self.exclusive:
+            result = [dataclasses.replace(candidate, loss=torch.inf) for candidate in candidates]
         for number, loss, actions in zip(chosen, found.loss.tolist(), found.actions, strict=True):
-            if loss < candidates[number].loss:
+            if loss < result[number].loss:
                 result[number] = dataclasses.replace(candidates[number], loss=loss, actions=actions)
         return result
 

@@ -10,6 +10,7 @@ import torch
 from cpdeform.core.errors import InputError
 from cpdeform.core.objective import Objective
 from cpdeform.core.placer import Candidate
+from cpdeform.planning.coarse import CoarseModel
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.phase import Phase, Scope
 from cpdeform.planning.workbench import Workbench
@@ -25,6 +26,7 @@ class PhaseScreening(Phase):
     Attributes:
         keep: Number of candidates that the next phases go on with; the others get an infinite loss.
         objective: The loss; None for the stage's own.
+        coarse: Rolls out with fewer particles, by its own loss; None for all of them.
         initial_noise: Standard deviation of the first actions of candidates that bring none.
         name: The phase's name.
 
@@ -35,6 +37,7 @@ class PhaseScreening(Phase):
     scope: ClassVar[Scope] = "round"
     keep: int
     objective: Objective | None = None
+    coarse: CoarseModel | None = None
     initial_noise: float = 0.01
     name: str = "screening"
 
@@ -45,7 +48,10 @@ class PhaseScreening(Phase):
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
         """All candidates, the losses of those that are left out infinite."""
         candidates = bench.first_actions(candidates, TrajectoryOptimizer(initial_noise=self.initial_noise))
-        losses = bench.rollout_losses(candidates, self.objective, phase=self.name)
+        if self.coarse is None:
+            losses = bench.rollout_losses(candidates, self.objective, phase=self.name)
+        else:
+            losses = self.coarse.rollout_losses(bench, candidates, phase=self.name)
         order = torch.where(torch.isfinite(losses), losses, torch.inf).argsort(stable=True)
         kept = {int(number) for number in order[: self.keep] if bool(torch.isfinite(losses[number]))}
         return [

@@ -13,7 +13,7 @@ from cpdeform.core.final_gradient import takes_final_gradient
 from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
-from cpdeform.planning.coarse import CoarsePlanner
+from cpdeform.planning.coarse import CoarseModel
 from cpdeform.planning.interrupted import StageInterrupted
 from cpdeform.planning.joint import polish_jointly
 from cpdeform.planning.objectives.shape import ObjectiveShape
@@ -33,10 +33,6 @@ SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
 
 
-FULL_ITERATIONS = 5
-"""Gradient evaluations, with all particles, of each of the best plans of a coarse stage."""
-
-
 class StrategySculpt(Strategy):
     """Each stage is one touch, the best of many; a few of them at a time are then polished together.
 
@@ -54,8 +50,8 @@ class StrategySculpt(Strategy):
         polished: Candidates of the first step of polishing, and of the second.
         iterations: Gradient evaluations of each of them in these steps.
         together: Stages that are polished together, before any of them is final.
-        joint_iterations: Gradient evaluations of each of them in that, with fewer particles and then with all.
-        coarse: Whether touches are tried with fewer particles, where there are many; see `cpdeform.planning.coarse`.
+        joint_iterations: Gradient evaluations of each of them in that.
+        coarse: Whether touches are screened with fewer particles, where there are many; see `cpdeform.planning.coarse`.
         idle: Stages without a gain in a row after which the run ends.
 
     Raises:
@@ -70,19 +66,22 @@ class StrategySculpt(Strategy):
         polished: tuple[int, int] = (5, 2),
         iterations: tuple[int, int] = (4, 8),
         together: int = 6,
-        joint_iterations: tuple[int, int] = (40, 15),
+        joint_iterations: int = 40,
         coarse: bool = True,
         idle: int = 3,
     ) -> None:
         numbers = {"touches": touches, "variations": variations, "idle": idle}
-        numbers |= {"together": together, "joint_iterations": min(joint_iterations)}
+        numbers |= {"together": together, "joint_iterations": joint_iterations}
         numbers |= {"polished": min(polished), "iterations": min(iterations)}
         for name, number in numbers.items():
             if number < 1:
                 raise InputError(name, came=str(number), expected="at least 1")
         self.touches, self.variations, self.idle = touches, variations, idle
         self.polished, self.iterations = tuple(polished), tuple(iterations)
-        self.together, self.joint_iterations, self.coarse = together, tuple(joint_iterations), coarse
+        self.together, self.coarse = together, coarse
+        self._joint = TrajectoryOptimizer(
+            iterations=joint_iterations, learning_rate=0.06, pruner=PrunerNone(), backtrack=3, annealed=True
+        )
 
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
         """The placer of touches, and the loss that sees crumbs."""
@@ -101,22 +100,26 @@ class StrategySculpt(Strategy):
         ]
         return (
             PhaseScreening(keep=SCREENED),
-            *(PhasePolish(keep=keep, optimizer=optimizer) for keep, optimizer in optimizers),
+            *(
+                PhasePolish(keep=keep, optimizer=optimizer, exclusive=number == 0)
+                for number, (keep, optimizer) in enumerate(optimizers)
+            ),
         )
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
         """One touch a stage, from rest to rest, some polished together; a few stages without a gain do not end the run."""
         planner, start = from_rest(planner, start)
-        polish = TrajectoryOptimizer(iterations=FULL_ITERATIONS, learning_rate=0.05, pruner=PrunerNone(), backtrack=3)
-        coarse = CoarsePlanner.of(planner, start, polish=polish) if self.coarse else None
+        if self.coarse:
+            planner = screened_coarsely(planner)
         finished: list[StageResult] = []
         end = start.first_stage + start.stages
         for first in range(start.first_stage, end, self.together):
             found: list[StageResult] = []
             try:
-                for result in self._touches(planner, coarse, start, range(first, min(first + self.together, end)), finished):
+                for result in self._touches(planner, start, range(first, min(first + self.together, end)), finished):
                     found.append(result)
-                found = self._polished(planner, coarse, found)
+                if takes_final_gradient(planner.simulator):
+                    found = polish_jointly(planner, found, self._joint)
             except KeyboardInterrupt as interruption:
                 yield from found
                 if isinstance(interruption, StageInterrupted):
@@ -127,39 +130,29 @@ class StrategySculpt(Strategy):
             if self._is_over(finished):
                 return
 
-    def _touches(
-        self, planner: Planner, coarse: CoarsePlanner | None, start: Start, stages: range, finished: Sequence[StageResult]
-    ) -> Iterator[StageResult]:
+    def _touches(self, planner: Planner, start: Start, stages: range, finished: Sequence[StageResult]) -> Iterator[StageResult]:
         """Stages one after the other, each by itself."""
         before = list(finished)
         for index in stages:
             state, warm = (before[-1].state, before[-1].warm) if before else (start.state, None)
-            if coarse is None:
-                before.append(planner.stage(start, index, state, before, warm=warm))
-            else:
-                before.append(coarse.stage(index, state, warm=warm))
+            before.append(planner.stage(start, index, state, before, warm=warm))
             yield before[-1]
             if self._is_over(before):
                 return
-
-    def _polished(self, planner: Planner, coarse: CoarsePlanner | None, found: list[StageResult]) -> list[StageResult]:
-        """Stages polished together, as far as the simulator's gradients can be chained."""
-        if not takes_final_gradient(planner.simulator):
-            return found
-        first, last = (
-            TrajectoryOptimizer(iterations=count, learning_rate=0.06, pruner=PrunerNone(), backtrack=3, annealed=True)
-            for count in self.joint_iterations
-        )
-        if coarse is None:
-            return polish_jointly(planner, found, first)
-        last = dataclasses.replace(last, learning_rate=0.03)
-        return polish_jointly(planner, found, last, coarse=coarse, coarse_optimizer=first)
 
     def _is_over(self, results: Sequence[StageResult]) -> bool:
         """Whether the last stages gained nothing, or the last one broke."""
         last = results[-self.idle :]
         stuck = len(last) == self.idle and all(result.status is not Status.FINISHED for result in last)
         return stuck or results[-1].status is Status.NON_FINITE
+
+
+def screened_coarsely(planner: Planner) -> Planner:
+    """A planner whose screening goes by fewer particles, where there are many and the loss is made for it."""
+    objective = planner.objective
+    model = CoarseModel.of(planner.simulator, objective) if isinstance(objective, ObjectiveShape) else None
+    phases = [dataclasses.replace(phase, coarse=model) if isinstance(phase, PhaseScreening) else phase for phase in planner.phases]
+    return dataclasses.replace(planner, phases=phases)
 
 
 def from_rest(planner: Planner, start: Start) -> tuple[Planner, Start]:
