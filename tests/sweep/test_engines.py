@@ -12,6 +12,7 @@ import psutil
 import pytest
 from campaign import Campaign, digests
 
+from cpdeform.core.errors import EngineError
 from cpdeform.sweep.engines.local import EngineLocal
 from cpdeform.sweep.queue import Queue
 from cpdeform.sweep.status import sweep_status
@@ -36,6 +37,15 @@ def test_local_workers(tmp_path, monkeypatch):
             killed[0].send_signal(signal.SIGKILL)
     check_all_done(queue, campaign)
     assert digests(queue) == expected
+
+
+def test_workers_that_die_in_vain_are_an_error(tmp_path, monkeypatch):
+    campaign = Campaign(tmp_path, monkeypatch, jobs=1, delay=0.0)
+    queue = campaign.new("broken")
+    (tmp_path / "broken" / "sweep.json").write_text("{}")
+    with pytest.raises(EngineError, match="workers die with nothing done"):
+        list(EngineLocal(workers=1).work(queue, WorkSettings()))
+    assert sweep_status(queue).waiting == 1
 
 
 @contextlib.contextmanager
