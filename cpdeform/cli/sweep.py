@@ -102,6 +102,18 @@ def table_command(
     _report(Queue(directory), as_json=as_json)
 
 
+@sweep.command("retry")
+def retry_command(directory: Directory) -> None:
+    """Put failed jobs back into the queue, for `cpdeform sweep work` to do."""
+    from cpdeform.sweep.queue import FAILED, Queue
+
+    queue = Queue(directory)
+    failed = queue.listed(FAILED)
+    for name in failed:
+        queue.forget(name)
+    typer.echo(f"{len(failed)} jobs are in the queue again")
+
+
 def read_shard(text: str) -> tuple[int, int]:
     """Read ``i/n``.
 

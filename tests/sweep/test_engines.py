@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ import psutil
 import pytest
 from campaign import Campaign, digests
 
+from cpdeform.core.errors import EngineError
 from cpdeform.sweep.engines.local import EngineLocal
 from cpdeform.sweep.queue import Queue
 from cpdeform.sweep.status import sweep_status
@@ -37,13 +39,21 @@ def test_local_workers(tmp_path, monkeypatch):
     assert digests(queue) == expected
 
 
-@pytest.fixture
-def ray_cluster(monkeypatch) -> Iterator[Any]:
+def test_workers_that_die_in_vain_are_an_error(tmp_path, monkeypatch):
+    campaign = Campaign(tmp_path, monkeypatch, jobs=1, delay=0.0)
+    queue = campaign.new("broken")
+    (tmp_path / "broken" / "sweep.json").write_text("{}")
+    with pytest.raises(EngineError, match="workers die with nothing done"):
+        list(EngineLocal(workers=1).work(queue, WorkSettings()))
+    assert sweep_status(queue).waiting == 1
+
+
+@contextlib.contextmanager
+def ray_cluster() -> Iterator[Any]:
     """A Ray cluster on loopback: a head and two more nodes with a core each, every one of several processes."""
-    ray = pytest.importorskip("ray", reason='NOT TESTED: the engine ray needs pip install "cpdeform[ray]"')
+    import ray
     from ray.cluster_utils import Cluster
 
-    monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     small: dict[str, Any] = {"object_store_memory": 80_000_000, "num_cpus": 1}
     cluster = Cluster(initialize_head=True, head_node_args={**small, "include_dashboard": False})
     try:
@@ -53,30 +63,32 @@ def ray_cluster(monkeypatch) -> Iterator[Any]:
         cluster.shutdown()
 
 
-def ray_with_a_killed_node(campaign: Campaign, ray_cluster: Any) -> None:
+def ray_with_a_killed_node(campaign: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray", reason='NOT TESTED: the engine ray needs pip install "cpdeform[ray]"')
     from cpdeform.sweep.engines.ray import EngineRay
 
-    cluster, nodes = ray_cluster
+    monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     expected, queue = campaign.undisturbed(), campaign.new("ray")
-    outcomes = EngineRay(address=cluster.address, memory_gb=0.1).work(queue, SETTINGS)
-    for done, outcome in enumerate(outcomes, start=1):
-        assert outcome.outcome == "done", outcome
-        if done == campaign.jobs // 2:
-            cluster.remove_node(nodes[0], allow_graceful=False)
+    with ray_cluster() as (cluster, nodes):
+        outcomes = EngineRay(address=cluster.address, memory_gb=0.1).work(queue, SETTINGS)
+        for done, outcome in enumerate(outcomes, start=1):
+            assert outcome.outcome == "done", outcome
+            if done == campaign.jobs // 2:
+                cluster.remove_node(nodes[0], allow_graceful=False)
     check_all_done(queue, campaign)
     assert digests(queue) == expected
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning", "ignore::FutureWarning")
-def test_ray(tmp_path, monkeypatch, ray_cluster):
-    ray_with_a_killed_node(Campaign(tmp_path, monkeypatch, jobs=6, delay=0.02), ray_cluster)
+def test_ray(tmp_path, monkeypatch):
+    ray_with_a_killed_node(Campaign(tmp_path, monkeypatch, jobs=6, delay=0.02), monkeypatch)
 
 
 @pytest.mark.sweeps
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning", "ignore::FutureWarning")
-def test_ray_with_two_hundred_jobs(tmp_path, monkeypatch, ray_cluster):
-    ray_with_a_killed_node(Campaign(tmp_path, monkeypatch, jobs=200, delay=0.05), ray_cluster)
+def test_ray_with_two_hundred_jobs(tmp_path, monkeypatch):
+    ray_with_a_killed_node(Campaign(tmp_path, monkeypatch, jobs=200, delay=0.05), monkeypatch)
 
 
 def slurm_with_a_preemption(campaign: Campaign, *, workers: int) -> None:

@@ -158,7 +158,8 @@ def test_failures_and_what_comes_after(tmp_path):
     assert work(queue) == ["b", "c", "a"]
     reasons = {name: content["reason"] for name, content in queue.outcomes(queue.listed(FAILED))}
     assert reasons == {"c": "KeyError: 'number'"}
-    queue.forget("c")
+    retried = CliRunner().invoke(app, ["sweep", "retry", str(tmp_path)])
+    assert retried.output == "1 jobs are in the queue again\n"
     assert work(queue, lambda context: {}) == ["c"]
     assert not (tmp_path / "records" / "c").exists()
 

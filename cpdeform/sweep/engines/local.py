@@ -26,6 +26,10 @@ SECONDS_TO_END = 30.0
 """How long workers that were told to end may take: they give their jobs back."""
 
 
+DEATHS_IN_VAIN = 10
+"""How often, for each worker, processes may die one after the other with no job done between."""
+
+
 @dataclasses.dataclass(frozen=True)
 class _Child:
     """A worker's process, by the name of the worker."""
@@ -49,17 +53,21 @@ class EngineLocal(Engine):
         """Do all jobs; see `Engine.work`."""
         events: SimpleQueue[Event] = SimpleQueue()
         children = {_start(queue, settings, events) for _ in range(self.workers or room(queue))}
+        in_vain, most = 0, len(children) * DEATHS_IN_VAIN
         try:
             while children:
                 child, outcome = events.get()
                 if outcome is not None:
+                    in_vain = 0
                     yield outcome
                     continue
                 children.discard(child)
-                if child.process.wait() != 0 and _died(queue, settings, child, others=bool(children)):
+                if child.process.wait() != 0:
+                    in_vain += 1
+                    _died(queue, settings, child, give_up=in_vain > most)
                     children.add(_start(queue, settings, events))
         finally:
-            _end(children)
+            _end(queue, settings, children)
 
 
 def room(queue: Queue) -> int:
@@ -103,21 +111,19 @@ def _listen(child: _Child, events: SimpleQueue[Event]) -> None:
     events.put((child, None))
 
 
-def _died(queue: Queue, settings: WorkSettings, child: _Child, *, others: bool) -> bool:
-    """Give the job of a child that died back; whether another one may take its place.
+def _died(queue: Queue, settings: WorkSettings, child: _Child, *, give_up: bool) -> None:
+    """Give the job of a child that died back.
 
     Raises:
-        EngineError: It died with nothing done, and it was the last: the next would fare no better.
+        EngineError: It had none, and ended by itself, or too many have died with nothing done: the next would fare no better.
     """
-    if return_lost(queue, settings, worker=child.identity) or child.process.returncode < 0:
-        return True
-    if not others:
-        raise EngineError(f"the workers ended with exit code {child.process.returncode}; see their messages above.")
-    return False
+    had_job = bool(return_lost(queue, settings, worker=child.identity))
+    if give_up or not (had_job or child.process.returncode < 0):
+        raise EngineError(f"workers die with nothing done (exit code {child.process.returncode}); see their messages above.")
 
 
-def _end(children: set[_Child]) -> None:
-    """Tell children to end, and wait for that."""
+def _end(queue: Queue, settings: WorkSettings, children: set[_Child]) -> None:
+    """Tell children to end, and wait for that; the job of one that had to be killed goes back."""
     for child in children:
         with contextlib.suppress(OSError):
             child.process.terminate()
@@ -127,6 +133,7 @@ def _end(children: set[_Child]) -> None:
         except subprocess.TimeoutExpired:
             child.process.kill()
             child.process.wait()
+            return_lost(queue, settings, worker=child.identity)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
