@@ -127,7 +127,7 @@ def _plain(content: Any) -> dict[str, Any]:
 
 def _name(task: str, method: str, seed: int) -> str:
     """Name of a run's job; a task's name may hold what a file's cannot."""
-    plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", task)
+    plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", task).lstrip(".+-")
     return f"{plain if plain == task else f'{plain}-{zlib.crc32(task.encode()):08x}'}-{method}-seed{seed}"
 
 

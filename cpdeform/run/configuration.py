@@ -39,6 +39,7 @@ class OptimizerConfiguration(FrozenModel):
     initial_noise: NonNegativeFloat = 0.01
     pruner: Literal["halving", "none"] = "halving"
     backtrack: Count | None = 4
+    annealed: bool = False
 
 
 class PrioritiesConfiguration(FrozenModel):
