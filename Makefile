@@ -11,7 +11,7 @@ OUT ?= runs/first
 
 SANITIZED := plugins/cpdeform-native/build/sanitized
 
-.PHONY: run test quick faults sweeps lint goals sanitize clean
+.PHONY: run test quick faults sweeps lint goals pictures sanitize clean
 
 run: $(NATIVE)
 	$(BIN)/cpdeform run writer --out $(OUT) --overwrite
@@ -47,6 +47,11 @@ lint: $(INSTALLED)
 GOALS ?=
 goals: $(NATIVE)
 	$(BIN)/python -m cpdeform.tasks.make_goals --check $(GOALS)
+
+# All pictures of README and docs, some minutes; `make pictures PICTURES="writer page"` draws some of them. The page needs Chromium.
+PICTURES ?=
+pictures: $(NATIVE)
+	$(BIN)/python scripts/draw_docs.py $(PICTURES)
 
 # The C++ code under AddressSanitizer and UndefinedBehaviorSanitizer: arguments of all sorts, right and wrong, and a few rollouts,
 # gradients and transports. Python is not built with them, so their runtime has to be loaded first; what Python never frees is no leak.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections.abc import Callable, Sequence
 
 import torch
@@ -38,6 +39,7 @@ class Iteration:
         memory: Memory of rollout and gradient; measured in one iteration, after the first if there are several, else None.
         gradient_norm: Euclidean norm (B,) of the gradient by the actions, objective units; nan where there was none. None where
             it is unknown.
+        time: When it was done, Unix seconds.
         phase: Name of the phase, e.g. ``"search"``; the losses of another phase may be in another unit.
     """
 
@@ -49,6 +51,7 @@ class Iteration:
     memory: MemoryUse | None = None
     phase: str = SEARCH
     gradient_norm: Tensor | None = None
+    time: float = dataclasses.field(default_factory=time.time)
 
 
 @dataclasses.dataclass(frozen=True)

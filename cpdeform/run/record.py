@@ -8,8 +8,8 @@
     went on from, or null; its stages go on counting, so that the first file is that of the stage after the other record's
     last one.
 ``metrics.jsonl``
-    A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage. ``time`` is in
-    seconds since the run began (since it was written, of one saved afterwards), ``gradient_norm`` that by the actions.
+    A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage. ``time``
+    is when an iteration was done (Unix seconds), ``gradient_norm`` that of its gradient by the actions.
 ``.run.lock``
     Number of the process that writes, while it does.
 ``goal.h5``, ``stage-000.h5``, ...
@@ -22,7 +22,6 @@ import contextlib
 import datetime
 import errno
 import json
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -96,7 +95,6 @@ class RunRecorder(Observer):
         self._origins = origins
         self._overwrite = overwrite
         self._run: dict[str, Any] = {}
-        self._begun = time.perf_counter()
         self._batch: dict[int, int] = {}
         self._rescued = False
         check_directory(self.directory, overwrite=overwrite)
@@ -121,7 +119,6 @@ class RunRecorder(Observer):
     def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
         """Begin the record: everything that is known before the first stage."""
         check_directory(self.directory, overwrite=self._overwrite)
-        self._begun = time.perf_counter()
         with self._writing():
             self.directory.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
@@ -179,6 +176,7 @@ class RunRecorder(Observer):
                 "best_loss": iteration.best_loss,
                 "gradient_norm": iteration.gradient_norm,
                 "seconds": iteration.seconds,
+                "time": round(iteration.time, 3),
             }
         )
 
@@ -251,7 +249,6 @@ class RunRecorder(Observer):
 
     def _append(self, line: dict[str, Any]) -> None:
         """Append a line to the metrics; the file is closed at once, so that the line outlives this process."""
-        line = {**line, "time": round(time.perf_counter() - self._begun, 3)}
         with self._writing(), (self.directory / METRICS_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(to_json(line), allow_nan=False) + "\n")
 

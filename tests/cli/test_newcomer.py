@@ -6,6 +6,7 @@ import json
 import shlex
 import subprocess
 import sys
+import time
 
 import pytest
 import torch
@@ -97,11 +98,12 @@ def test_progress_tells_parts_and_batches(directory, monkeypatch):
 
 
 def test_metrics_have_time_and_gradient_norm(directory):
+    begun = time.time()
     invoke("run", "shift.yaml", *PARTS, "--out", "run")
     lines = load_record("run").metrics
-    times = [line["time"] for line in lines]
+    times = [line["time"] for line in lines if line["kind"] == "iteration"]
+    assert begun - 1.0 < times[0] <= times[-1] < time.time() + 1.0
     assert times == sorted(times)
-    assert 0.0 <= times[0] <= times[-1] < 600.0
     norms = [norm for line in lines if line["kind"] == "iteration" for norm in line["gradient_norm"]]
     assert norms
     assert all(norm is None or norm > 0.0 for norm in norms)
