@@ -22,7 +22,7 @@ from cpdeform.core.scene import (
 )
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.report import draw_run
-from cpdeform.report.animation import draw_animation
+from cpdeform.report.animation import _between, _moments, draw_animation
 from cpdeform.report.draw import draw_chosen
 from cpdeform.report.pictures import draw_picture
 from cpdeform.report.render import fit_camera, render
@@ -115,7 +115,8 @@ def panels(path):
 
 # imageio's reader of videos (not its writer) leaves its pipes open.
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_picture_and_animation(record):
+def test_picture_and_animation(record, monkeypatch):
+    monkeypatch.setattr("cpdeform.report.animation.MOST_BETWEEN", 1)
     directory = record()
     path = draw_run(directory)
     assert path == directory / "picture.png"
@@ -129,9 +130,9 @@ def test_picture_and_animation(record):
         frames = list(reader.iter_data())
     del reader
     gc.collect()
-    # 2 stages of 5 steps with two frames between them, the start included, and the last one held for a second.
-    assert len(frames) == 2 * (5 * 3 + 1) + 18
-    assert np.abs(frames[0].astype(float) - frames[30]).mean() > 0.5
+    # 2 stages of 5 steps, start included, and the last one held for a second.
+    assert len(frames) == 2 * 6 + 6
+    assert np.abs(frames[0].astype(float) - frames[10]).mean() > 0.5
     assert {path.name for path in directory.iterdir() if path.name.startswith(".")} == set()
 
 
@@ -163,6 +164,13 @@ def test_gif_without_ffmpeg(record, monkeypatch):
     path = draw_animation(load_record(directory))
     assert path == directory / "animation.gif"
     assert len(imageio.v2.mimread(path)) >= 6
+
+
+def test_frames_between_steps_do_not_lead_from_stage_to_stage():
+    moments = _moments([(0, 0), (0, 1), (1, 0), (1, 1)], 2)
+    assert moments == [(0, 0.0), (0, 0.5), (0, 1.0), (1, 0.0), (1, 0.5), (1, 1.0)]
+    np.testing.assert_allclose(_between(np.array([[0.0, 2.0], [1.0, 4.0]]), 0.25), [0.25, 2.5])
+    np.testing.assert_allclose(_between(np.array([[0.0, 2.0], [1.0, 4.0]]), 1.0), [1.0, 4.0])
 
 
 def test_sheet_and_curves(record, tmp_path):
