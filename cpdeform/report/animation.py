@@ -54,7 +54,7 @@ def draw_animation(record: RunRecord, *, camera: str | tuple[float, float] = "de
         return None
     between = min(max(MAX_FRAMES // len(steps), 1), MOST_BETWEEN)
     rate = STEPS_PER_SECOND * between
-    pictures = list(_draw_frames(record, make_view(record, camera=camera), _moments(record, steps, between)))
+    pictures = list(_draw_frames(record, make_view(record, camera=camera), _moments(steps, between)))
     pictures += [pictures[-1]] * round(HOLD_SECONDS * rate)
     path = record.directory / f"animation.{form}"
     options: dict[str, Any] = (
@@ -80,7 +80,7 @@ def _steps(record: RunRecord) -> list[tuple[int, int]]:
     return [steps[index] for index in np.linspace(0, len(steps) - 1, count).round().astype(int)] if steps else []
 
 
-def _moments(record: RunRecord, steps: list[tuple[int, int]], between: int) -> list[tuple[int, float]]:
+def _moments(steps: list[tuple[int, int]], between: int) -> list[tuple[int, float]]:
     """Stage and time of each frame: `between` of them for each step that another one of its stage follows."""
     moments: list[tuple[int, float]] = []
     for place, (number, step) in enumerate(steps):
