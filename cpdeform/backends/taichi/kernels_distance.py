@@ -1,4 +1,4 @@
-"""Signed distances of the tools in their local frames, outward normals, and the derivative of the normals.
+"""Signed distances of the tools in their local frames, outward normals, and how these change.
 
 The entries of a tool's `size`, lengths: Sphere (radius); Capsule, RollingPin and Chopsticks (radius, height); Box (half extents,
 rounding); Cylinder (radius, half height); Torus (major radius, tube radius). Chopsticks are the capsule nearer to a point:
@@ -66,29 +66,48 @@ def build_distance(real: Any) -> SimpleNamespace:
         return result
 
     @ti.func
-    def distance_and_normal(kind, size, p):
-        """Signed distance and outward normal at the local point p, as (normal, distance)."""
+    def project(g, normal):
+        return g - g.dot(normal) * normal
+
+    @ti.func
+    def surface(kind, size, p, g):
+        """Normal and signed distance at the local point p, and how the normal changes along g, as (normal, distance, bend).
+
+        All that kernels know of a kind. The derivative of a distance's gradient is a symmetric matrix, the distance's Hessian, so
+        that `bend` is the adjoint of the normal, too; where it is not used, the compiler leaves it out.
+        """
         distance = real(zero)
         normal = vec3(zero, one, zero)
+        bend = vec3(zero, zero, zero)
         if kind == SPHERE:
             r = length(p)
             distance = r - size[0]
             normal = p / r
+            bend = project(g, normal) / r
         if kind == CAPSULE or kind == ROLLING_PIN or kind == CHOPSTICKS:
             h = half * size[1]
             q = vec3(p[0], p[1] - ti.min(ti.max(p[1], -h), h), p[2])
+            moved = g
+            if ti.abs(p[1]) < h:
+                moved[1] = zero
             r = length(q)
             distance = r - size[0]
             normal = q / r
+            bend = project(moved, normal) / r
         if kind == BOX:
             b = vec3(size[0], size[1], size[2])
             q = ti.abs(p) - b
             largest = q.max()
             if largest > zero:
                 o = box_offset(p, b)
+                moved = g
+                for a in ti.static(range(3)):
+                    if q[a] <= zero:
+                        moved[a] = zero
                 r = ti.sqrt(o.dot(o))
                 distance = r - size[3]
                 normal = o / r
+                bend = project(moved, normal) / r
             else:
                 distance = largest - size[3]
                 axis = largest_axis(q)
@@ -98,76 +117,33 @@ def build_distance(real: Any) -> SimpleNamespace:
                         normal[a] = sign(p[a])
         if kind == CYLINDER:
             u, r = radial_unit(p)
+            turn = project(vec3(g[0], zero, g[2]), u) / r
             side = r - size[0]
             top = ti.abs(p[1]) - size[1]
             up = vec3(zero, sign(p[1]), zero)
             if side > zero and top > zero:
                 distance = ti.sqrt(side * side + top * top)
                 normal = (side / distance) * u + (top / distance) * up
+                moved_side = g.dot(u)
+                moved_top = g.dot(up)
+                moved = moved_side * u + moved_top * up + side * turn
+                bend = (moved - (side * moved_side + top * moved_top) / distance * normal) / distance
             else:
                 distance = ti.max(side, top)
                 normal = up
                 if side > top:
                     normal = u
+                    bend = turn
         if kind == TORUS:
             u, r = radial_unit(p)
-            q = (r - size[0]) * u + vec3(zero, p[1], zero)
+            side = r - size[0]
+            q = side * u + vec3(zero, p[1], zero)
+            moved = g.dot(u) * u + side / r * project(vec3(g[0], zero, g[2]), u) + vec3(zero, g[1], zero)
             s = length(q)
             distance = s - size[1]
             normal = q / s
-        return normal, distance
-
-    @ti.func
-    def project(g, normal):
-        return g - g.dot(normal) * normal
-
-    @ti.func
-    def normal_adjoint(kind, size, p, g):
-        """(d normal / d p)^T g; the derivative is a symmetric matrix, the distance's Hessian."""
-        result = vec3(zero, zero, zero)
-        if kind == SPHERE:
-            r = length(p)
-            result = project(g, p / r) / r
-        if kind == CAPSULE or kind == ROLLING_PIN or kind == CHOPSTICKS:
-            h = half * size[1]
-            q = vec3(p[0], p[1] - ti.min(ti.max(p[1], -h), h), p[2])
-            r = length(q)
-            result = project(g, q / r) / r
-            if ti.abs(p[1]) < h:
-                result[1] = zero
-        if kind == BOX:
-            b = vec3(size[0], size[1], size[2])
-            q = ti.abs(p) - b
-            if q.max() > zero:
-                o = box_offset(p, b)
-                r = ti.sqrt(o.dot(o))
-                result = project(g, o / r) / r
-                for axis in ti.static(range(3)):
-                    if q[axis] <= zero:
-                        result[axis] = zero
-        if kind == CYLINDER:
-            u, r = radial_unit(p)
-            side = r - size[0]
-            top = ti.abs(p[1]) - size[1]
-            around = vec3(-u[2], zero, u[0])
-            turn = g.dot(around) / r * around
-            if side > zero and top > zero:
-                d = ti.sqrt(side * side + top * top)
-                normal = (side / d) * u + vec3(zero, sign(p[1]) * top / d, zero)
-                across = project(vec3(zero, one, zero), normal)
-                across = across / ti.max(ti.sqrt(across.dot(across)), real(1e-6))
-                result = (side / d) * turn + g.dot(across) / d * across
-            elif side > top:
-                result = turn
-        if kind == TORUS:
-            u, r = radial_unit(p)
-            q = (r - size[0]) * u + vec3(zero, p[1], zero)
-            s = length(q)
-            normal = q / s
-            around = vec3(-u[2], zero, u[0])
-            planar = g - g.dot(around) * around
-            result = project(planar, normal) / s + ((r - size[0]) / (r * s)) * g.dot(around) * around
-        return result
+            bend = project(moved, normal) / s
+        return normal, distance, bend
 
     @ti.func
     def pose_position(pose):
@@ -194,8 +170,7 @@ def build_distance(real: Any) -> SimpleNamespace:
 
     return SimpleNamespace(
         part_centre=part_centre,
-        distance_and_normal=distance_and_normal,
-        normal_adjoint=normal_adjoint,
+        surface=surface,
         pose_position=pose_position,
         pose_axis=pose_axis,
         rotate=rotate,

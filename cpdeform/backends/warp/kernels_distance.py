@@ -1,4 +1,4 @@
-"""Signed distances of the tools in their local frames, outward normals, and the derivative of the normals.
+"""Signed distances of the tools in their local frames, outward normals, and how these change.
 
 The entries of `Tool.size`, lengths: Sphere (radius); Capsule, RollingPin and Chopsticks (radius, height); Box (half extents,
 rounding); Cylinder (radius, half height); Torus (major radius, tube radius). Chopsticks are the capsule nearer to a point:
@@ -67,105 +67,78 @@ def build_distance(real: Any) -> SimpleNamespace:
         return result
 
     @wp.func
-    def distance_and_normal(kind: int, size: vec4, p: vec3):
-        """Signed distance and outward normal at the local point p, as (normal, distance)."""
+    def project(g: vec3, normal: vec3):
+        return g - wp.dot(g, normal) * normal
+
+    @wp.func
+    def surface(kind: int, size: vec4, p: vec3, g: vec3):
+        """Normal and signed distance at the local point p, and how the normal changes along g, as (normal, distance, bend).
+
+        All that kernels know of a kind. The derivative of a distance's gradient is a symmetric matrix, the distance's Hessian, so
+        that `bend` is the adjoint of the normal, too; where it is not used, the compiler leaves it out.
+        """
         distance = zero
         normal = vec3(zero, one, zero)
+        bend = vec3(zero, zero, zero)
         if kind == wp.static(SPHERE):
             r = length(p)
             distance = r - size[0]
             normal = p / r
+            bend = project(g, normal) / r
         if kind == wp.static(CAPSULE) or kind == wp.static(ROLLING_PIN) or kind == wp.static(CHOPSTICKS):
             h = half * size[1]
             q = vec3(p[0], p[1] - wp.min(wp.max(p[1], -h), h), p[2])
+            moved = g
+            if wp.abs(p[1]) < h:
+                moved = vec3(g[0], zero, g[2])
             r = length(q)
             distance = r - size[0]
             normal = q / r
+            bend = project(moved, normal) / r
         if kind == wp.static(BOX):
             b = vec3(size[0], size[1], size[2])
             q = wp.abs(p) - b
             axis = largest_axis(q)
             if q[axis] > zero:
                 o = box_offset(p, b)
+                moved = wp.cw_mul(g, vec3(wp.step(-q[0]), wp.step(-q[1]), wp.step(-q[2])))
                 r = wp.sqrt(wp.dot(o, o))
                 distance = r - size[3]
                 normal = o / r
+                bend = project(moved, normal) / r
             else:
                 distance = q[axis] - size[3]
                 normal = vec3(zero, zero, zero)
                 normal[axis] = sign(p[axis])
         if kind == wp.static(CYLINDER):
             u, r = radial_unit(p)
+            turn = project(vec3(g[0], zero, g[2]), u) / r
             side = r - size[0]
             top = wp.abs(p[1]) - size[1]
             up = vec3(zero, sign(p[1]), zero)
             if side > zero and top > zero:
                 distance = wp.sqrt(side * side + top * top)
                 normal = (side / distance) * u + (top / distance) * up
+                moved_side = wp.dot(g, u)
+                moved_top = wp.dot(g, up)
+                moved = moved_side * u + moved_top * up + side * turn
+                bend = (moved - (side * moved_side + top * moved_top) / distance * normal) / distance
             else:
                 distance = wp.max(side, top)
                 normal = up
                 if side > top:
                     normal = u
+                    bend = turn
         if kind == wp.static(TORUS):
             u, r = radial_unit(p)
-            q = (r - size[0]) * u + vec3(zero, p[1], zero)
+            side = r - size[0]
+            q = side * u + vec3(zero, p[1], zero)
+            moved = wp.dot(g, u) * u + side / r * project(vec3(g[0], zero, g[2]), u) + vec3(zero, g[1], zero)
             s = length(q)
             distance = s - size[1]
             normal = q / s
-        return normal, distance
-
-    @wp.func
-    def project(g: vec3, normal: vec3):
-        return g - wp.dot(g, normal) * normal
-
-    @wp.func
-    def normal_adjoint(kind: int, size: vec4, p: vec3, g: vec3):
-        """(d normal / d p)^T g; the derivative is a symmetric matrix, the distance's Hessian."""
-        result = vec3(zero, zero, zero)
-        if kind == wp.static(SPHERE):
-            r = length(p)
-            result = project(g, p / r) / r
-        if kind == wp.static(CAPSULE) or kind == wp.static(ROLLING_PIN) or kind == wp.static(CHOPSTICKS):
-            h = half * size[1]
-            q = vec3(p[0], p[1] - wp.min(wp.max(p[1], -h), h), p[2])
-            r = length(q)
-            result = project(g, q / r) / r
-            if wp.abs(p[1]) < h:
-                result[1] = zero
-        if kind == wp.static(BOX):
-            b = vec3(size[0], size[1], size[2])
-            q = wp.abs(p) - b
-            if wp.max(q[0], wp.max(q[1], q[2])) > zero:
-                o = box_offset(p, b)
-                r = wp.sqrt(wp.dot(o, o))
-                result = project(g, o / r) / r
-                for axis in range(3):
-                    if q[axis] <= zero:
-                        result[axis] = zero
-        if kind == wp.static(CYLINDER):
-            u, r = radial_unit(p)
-            side = r - size[0]
-            top = wp.abs(p[1]) - size[1]
-            around = vec3(-u[2], zero, u[0])
-            turn = wp.dot(g, around) / r * around
-            if side > zero and top > zero:
-                d = wp.sqrt(side * side + top * top)
-                normal = (side / d) * u + vec3(zero, sign(p[1]) * top / d, zero)
-                across = project(vec3(zero, one, zero), normal)
-                across = across / wp.max(wp.sqrt(wp.dot(across, across)), real(1e-6))
-                result = (side / d) * turn + wp.dot(g, across) / d * across
-            elif side > top:
-                result = turn
-        if kind == wp.static(TORUS):
-            u, r = radial_unit(p)
-            q = (r - size[0]) * u + vec3(zero, p[1], zero)
-            s = length(q)
-            normal = q / s
-            around = vec3(-u[2], zero, u[0])
-            planar = g - wp.dot(g, around) * around
-            result = project(planar, normal) / s + ((r - size[0]) / (r * s)) * wp.dot(g, around) * around
-        return result
+            bend = project(moved, normal) / s
+        return normal, distance, bend
 
     @wp.func
     def pose_position(pose: vec8):
@@ -192,8 +165,7 @@ def build_distance(real: Any) -> SimpleNamespace:
 
     return SimpleNamespace(
         part_centre=part_centre,
-        distance_and_normal=distance_and_normal,
-        normal_adjoint=normal_adjoint,
+        surface=surface,
         pose_position=pose_position,
         pose_axis=pose_axis,
         rotate=rotate,

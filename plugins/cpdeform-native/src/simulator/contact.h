@@ -183,7 +183,7 @@ struct Contact {
     P gl = tool.spin.transposed(gvc);
     // normal and influence
     add_outer(gradient.rotation_before, gn, s.normal);
-    P gs = G::normal_adjoint(tool.kind, tool.size, local - centre, tool.rotation.transposed(gn));
+    P gs = G::surface(tool.kind, tool.size, local - centre, tool.rotation.transposed(gn)).bend;
     if (softness > 0 && s.distance > 0) gs -= s.normal * (gk * softness * k);
     gl += gs;
     if (tool.kind == cpdeform::chopsticks) gradient.gap += Real(0.5) * (local.x >= 0 ? -gs.x : gs.x);
