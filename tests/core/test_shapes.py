@@ -10,6 +10,7 @@ from toy_cone import ShapeCone, ToolCone
 
 from cpdeform.backends.scene_numbers import MOST_LENGTHS, tool_size
 from cpdeform.core.errors import InputError
+from cpdeform.core.meshes.filling import even_points
 from cpdeform.core.rotation import from_rotation_vector, rotate
 from cpdeform.core.scene import (
     BodyBox,
@@ -29,7 +30,6 @@ from cpdeform.core.shapes.kinds import BODIES, TOOLS
 from cpdeform.core.signed_distance import local_distance, signed_distance
 from cpdeform.placement.tool import surface_points, tool_half_extents
 from cpdeform.report.shapes import tool_surface
-from cpdeform.tasks.solids import even_points
 
 ORIGIN = (0.0, 0.0, 0.0)
 EXAMPLES: dict[str, ToolBase | BodyBox | BodySphere] = {

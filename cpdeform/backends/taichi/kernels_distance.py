@@ -1,19 +1,19 @@
 """Signed distances of the tools in their local frames, outward normals, and how these change.
 
 The entries of a tool's `size`, lengths: Sphere (radius); Capsule, RollingPin and Chopsticks (radius, height); Box (half extents,
-rounding); Cylinder (radius, half height); Torus (major radius, tube radius). Chopsticks are the capsule nearer to a point:
-`part_centre` is its centre.
+rounding); Cylinder (radius, half height); Torus (major radius, tube radius); Mesh (distance between nodes, numbers of nodes;
+its numbers are in `values` from `grid_first` on). Chopsticks are the capsule nearer to a point: `part_centre` is its centre.
 """
 
 import functools
 from types import SimpleNamespace
 from typing import Any
 
-from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, ROLLING_PIN, SPHERE, TORUS
+from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, MESH, ROLLING_PIN, SPHERE, TORUS
 from cpdeform.backends.taichi.kernels_types import build_types
 from cpdeform.backends.taichi.runtime import ti
 
-TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks", "Mesh")
 """The kinds of tools that the functions below know; the simulator refuses others."""
 
 
@@ -22,7 +22,7 @@ def build_distance(real: Any) -> SimpleNamespace:
     """Taichi functions of signed distances and rotations for one scalar type."""
     types = build_types(real)
     vec3, vec4 = types.vec3, types.vec4
-    zero, half, one, two = 0.0, 0.5, 1.0, 2.0
+    zero, half, three_quarters, one, two = 0.0, 0.5, 0.75, 1.0, 2.0
     # PlasticineLab's length: finite gradient at zero
     length_regularization = 1e-8
 
@@ -70,7 +70,50 @@ def build_distance(real: Any) -> SimpleNamespace:
         return g - g.dot(normal) * normal
 
     @ti.func
-    def surface(kind, size, p, g):
+    def spline(f):
+        """Weights of a quadratic B-spline at three nodes, `f` from the middle one, and their derivatives."""
+        weights = vec3(half * (half - f) * (half - f), three_quarters - f * f, half * (half + f) * (half + f))
+        return weights, vec3(f - half, -two * f, f + half)
+
+    @ti.func
+    def mesh_place(along, size, count):
+        """Where a coordinate lies in the grid: clipped, its nearest node, and how far it is beyond, in nodes."""
+        u = along / size + half * (count - one)
+        inside = ti.min(ti.max(u, one), count - two)
+        base = ti.min(ti.cast(inside + half, ti.i32), ti.cast(count, ti.i32) - 2)
+        return inside - ti.cast(base, real), base, u - inside
+
+    @ti.func
+    def mesh_surface(values: ti.template(), first, size, p, g):
+        """As `surface`, of a mesh: the quadratic B-spline of its distance; beyond the grid the way there is added."""
+        fx, bx, ox = mesh_place(p[0], size[0], size[1])
+        fy, by, oy = mesh_place(p[1], size[0], size[2])
+        fz, bz, oz = mesh_place(p[2], size[0], size[3])
+        wx, dx = spline(fx)
+        wy, dy = spline(fy)
+        wz, dz = spline(fz)
+        curve = vec3(one, -two, one)
+        distance = real(zero)
+        gradient = vec3(zero, zero, zero)
+        change = vec3(zero, zero, zero)
+        for i, j, k in ti.static(ti.ndrange(3, 3, 3)):
+            node = ((bx + i - 1) * ti.cast(size[2], ti.i32) + by + j - 1) * ti.cast(size[3], ti.i32) + bz + k - 1
+            c = values[first + node]
+            xy, xz, yz = dx[i] * dy[j] * wz[k], dx[i] * wy[j] * dz[k], wx[i] * dy[j] * dz[k]
+            distance += c * wx[i] * wy[j] * wz[k]
+            gradient += c * vec3(dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k], wx[i] * wy[j] * dz[k])
+            change += c * vec3(
+                curve[i] * wy[j] * wz[k] * g[0] + xy * g[1] + xz * g[2],
+                xy * g[0] + wx[i] * curve[j] * wz[k] * g[1] + yz * g[2],
+                xz * g[0] + yz * g[1] + wx[i] * wy[j] * curve[k] * g[2],
+            )
+        steep = ti.max(ti.sqrt(gradient.dot(gradient)) / size[0], real(1e-3))
+        normal = gradient / (steep * size[0])
+        distance += ti.sqrt(ox * ox + oy * oy + oz * oz) * size[0]
+        return normal, distance, project(change, normal) / (steep * size[0] * size[0])
+
+    @ti.func
+    def surface(values: ti.template(), first, kind, size, p, g):
         """Normal and signed distance at the local point p, and how the normal changes along g, as (normal, distance, bend).
 
         All that kernels know of a kind. The derivative of a distance's gradient is a symmetric matrix, the distance's Hessian, so
@@ -143,6 +186,8 @@ def build_distance(real: Any) -> SimpleNamespace:
             distance = s - size[1]
             normal = q / s
             bend = project(moved, normal) / s
+        if kind == MESH:
+            normal, distance, bend = mesh_surface(values, first, size, p, g)
         return normal, distance, bend
 
     @ti.func

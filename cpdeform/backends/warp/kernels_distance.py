@@ -1,8 +1,9 @@
 """Signed distances of the tools in their local frames, outward normals, and how these change.
 
 The entries of `Tool.size`, lengths: Sphere (radius); Capsule, RollingPin and Chopsticks (radius, height); Box (half extents,
-rounding); Cylinder (radius, half height); Torus (major radius, tube radius). Chopsticks are the capsule nearer to a point:
-`part_centre` is its centre.
+rounding); Cylinder (radius, half height); Torus (major radius, tube radius); Mesh (distance between nodes, numbers of nodes;
+its numbers are in `Parameters.grids` from `grid_first` on). Chopsticks are the capsule nearer to a point: `part_centre` is its
+centre.
 """
 
 import functools
@@ -11,10 +12,10 @@ from typing import Any
 
 import warp as wp
 
-from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, ROLLING_PIN, SPHERE, TORUS
+from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, MESH, ROLLING_PIN, SPHERE, TORUS
 from cpdeform.backends.warp.kernels_types import build_types
 
-TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks", "Mesh")
 """The kinds of tools that the functions below know; the simulator refuses others."""
 
 
@@ -23,7 +24,7 @@ def build_distance(real: Any) -> SimpleNamespace:
     """Warp functions of signed distances and rotations for one scalar type."""
     types = build_types(real)
     vec3, vec4, vec8 = types.vec3, types.vec4, types.vec8
-    zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
+    zero, half, three_quarters, one, two = real(0.0), real(0.5), real(0.75), real(1.0), real(2.0)
     # PlasticineLab's length: finite gradient at zero
     length_regularization = real(1e-8)
 
@@ -71,7 +72,53 @@ def build_distance(real: Any) -> SimpleNamespace:
         return g - wp.dot(g, normal) * normal
 
     @wp.func
-    def surface(kind: int, size: vec4, p: vec3, g: vec3):
+    def spline(f: real):
+        """Weights of a quadratic B-spline at three nodes, `f` from the middle one, and their derivatives."""
+        weights = vec3(half * (half - f) * (half - f), three_quarters - f * f, half * (half + f) * (half + f))
+        return weights, vec3(f - half, -two * f, f + half)
+
+    @wp.func
+    def mesh_place(along: real, size: real, count: real):
+        """Where a coordinate lies in the grid: clipped, its nearest node, and how far it is beyond, in nodes."""
+        u = along / size + half * (count - one)
+        inside = wp.min(wp.max(u, one), count - two)
+        base = wp.min(int(inside + half), int(count) - 2)
+        return inside - real(base), base, u - inside
+
+    @wp.func
+    def mesh_surface(grids: wp.array(dtype=real), first: int, size: vec4, p: vec3, g: vec3):
+        """As `surface`, of a mesh: the quadratic B-spline of its distance; beyond the grid the way there is added."""
+        fx, bx, ox = mesh_place(p[0], size[0], size[1])
+        fy, by, oy = mesh_place(p[1], size[0], size[2])
+        fz, bz, oz = mesh_place(p[2], size[0], size[3])
+        wx, dx = spline(fx)
+        wy, dy = spline(fy)
+        wz, dz = spline(fz)
+        curve = vec3(one, -two, one)
+        distance = zero
+        gradient = vec3(zero, zero, zero)
+        change = vec3(zero, zero, zero)
+        for n in range(27):
+            i = n // 9
+            j = (n // 3) % 3
+            k = n % 3
+            node = ((bx + i - 1) * int(size[2]) + by + j - 1) * int(size[3]) + bz + k - 1
+            c = grids[first + node]
+            xy, xz, yz = dx[i] * dy[j] * wz[k], dx[i] * wy[j] * dz[k], wx[i] * dy[j] * dz[k]
+            distance += c * wx[i] * wy[j] * wz[k]
+            gradient += c * vec3(dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k], wx[i] * wy[j] * dz[k])
+            change += c * vec3(
+                curve[i] * wy[j] * wz[k] * g[0] + xy * g[1] + xz * g[2],
+                xy * g[0] + wx[i] * curve[j] * wz[k] * g[1] + yz * g[2],
+                xz * g[0] + yz * g[1] + wx[i] * wy[j] * curve[k] * g[2],
+            )
+        steep = wp.max(wp.sqrt(wp.dot(gradient, gradient)) / size[0], real(1e-3))
+        normal = gradient / (steep * size[0])
+        distance += wp.sqrt(ox * ox + oy * oy + oz * oz) * size[0]
+        return normal, distance, project(change, normal) / (steep * size[0] * size[0])
+
+    @wp.func
+    def surface(grids: wp.array(dtype=real), first: int, kind: int, size: vec4, p: vec3, g: vec3):
         """Normal and signed distance at the local point p, and how the normal changes along g, as (normal, distance, bend).
 
         All that kernels know of a kind. The derivative of a distance's gradient is a symmetric matrix, the distance's Hessian, so
@@ -138,6 +185,8 @@ def build_distance(real: Any) -> SimpleNamespace:
             distance = s - size[1]
             normal = q / s
             bend = project(moved, normal) / s
+        if kind == wp.static(MESH):
+            normal, distance, bend = mesh_surface(grids, first, size, p, g)
         return normal, distance, bend
 
     @wp.func

@@ -58,7 +58,9 @@ def build_grid(real: Any) -> SimpleNamespace:
         """A node's velocity after contact with one tool."""
         local = rotate(before[3], -pose_axis(before), node - pose_position(before))
         centre = part_centre(tool.kind, tool.size, before[7], local)
-        local_normal, distance, _ = surface(tool.kind, tool.size, local - centre, vec3(zero, zero, zero))
+        local_normal, distance, _ = surface(
+            parameters.grids, tool.grid_first, tool.kind, tool.size, local - centre, vec3(zero, zero, zero)
+        )
         k = influence(parameters, distance)
         result = velocity
         if k > zero:
@@ -91,7 +93,9 @@ def build_grid(real: Any) -> SimpleNamespace:
         """Gradient with respect to the velocity before contact; adds those of both poses to `grad_pose`."""
         local = rotate(before[3], -pose_axis(before), node - pose_position(before))
         centre = part_centre(tool.kind, tool.size, before[7], local)
-        local_normal, distance, _ = surface(tool.kind, tool.size, local - centre, vec3(zero, zero, zero))
+        local_normal, distance, _ = surface(
+            parameters.grids, tool.grid_first, tool.kind, tool.size, local - centre, vec3(zero, zero, zero)
+        )
         k = influence(parameters, distance)
         result = g
         if k > zero:
@@ -136,7 +140,9 @@ def build_grid(real: Any) -> SimpleNamespace:
             gl = rotate(after[3], -pose_axis(after), gvc) - rotate(before[3], -pose_axis(before), gvc)
             # normal and influence
             gq_before += rotate_adjoint(before[3], pose_axis(before), local_normal, gn)
-            _normal, _distance, gs = surface(tool.kind, tool.size, local - centre, rotate(before[3], -pose_axis(before), gn))
+            _normal, _distance, gs = surface(
+                parameters.grids, tool.grid_first, tool.kind, tool.size, local - centre, rotate(before[3], -pose_axis(before), gn)
+            )
             if parameters.softness > zero and distance > zero:
                 gs -= (gk * parameters.softness * k) * local_normal
             gl += gs

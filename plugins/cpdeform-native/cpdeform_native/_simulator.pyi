@@ -35,6 +35,7 @@ class Scene:
         scale: Sequence[float],
         lower: Sequence[float],
         upper: Sequence[float],
+        grid: NDArray[np.float64] | None = None,
     ) -> None: ...
 
 class CheckpointsFloat:

@@ -67,7 +67,7 @@ struct Geometry {
   CPDEFORM_INLINE static P across(const P& g, const P& normal) { return g - normal * dot(g, normal); }
 
   // Outward normal and signed distance at a local point p, and how the normal changes along g. All that kernels know of a kind.
-  CPDEFORM_INLINE static Surface surface(int kind, const Real* size, const P& p, const P& g = {}) {
+  CPDEFORM_INLINE static Surface surface(int kind, const Real* size, const double* grid, const P& p, const P& g = {}) {
     switch (kind) {
       case cpdeform::sphere: {
         const Real r = length(p);
@@ -123,8 +123,53 @@ struct Geometry {
         const P normal = q * (1 / r);
         return {normal, r - size[0], across(moved, normal) * (1 / r)};
       }
+      case cpdeform::mesh:
+        return mesh_surface(size, grid, p, g);
     }
     cpdeform::throw_unknown_tool(kind);
+  }
+
+  // The quadratic B-spline of a mesh's signed distance, its normalised gradient, and the change of that along g. Beyond the grid, the
+  // distance at its nearest point and the way there.
+  static Surface mesh_surface(const Real* size, const double* grid, const P& p, const P& g) {
+    const Real at[3] = {p.x, p.y, p.z}, along[3] = {g.x, g.y, g.z};
+    Real weight[3][3], slope[3][3], beyond = 0;
+    int count[3], base[3];
+    for (int a = 0; a < 3; ++a) {
+      count[a] = int(size[1 + a]);
+      const Real u = at[a] / size[0] + Real(0.5) * Real(count[a] - 1);
+      // not a number goes to the first node
+      const Real inside = u > 1 ? (u < Real(count[a] - 2) ? u : Real(count[a] - 2)) : Real(1);
+      beyond += (u - inside) * (u - inside);
+      base[a] = int(inside + Real(0.5));
+      if (base[a] > count[a] - 2) base[a] = count[a] - 2;
+      const Real f = inside - Real(base[a]), low = Real(0.5) - f, high = Real(0.5) + f;
+      weight[a][0] = Real(0.5) * low * low;
+      weight[a][1] = Real(0.75) - f * f;
+      weight[a][2] = Real(0.5) * high * high;
+      slope[a][0] = -low;
+      slope[a][1] = -2 * f;
+      slope[a][2] = high;
+    }
+    const Real curve[3] = {1, -2, 1};
+    Real distance = 0;
+    P gradient, change;
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j)
+        for (int k = 0; k < 3; ++k) {
+          const int64_t node = (int64_t(base[0] + i - 1) * count[1] + base[1] + j - 1) * count[2] + base[2] + k - 1;
+          const Real c = Real(grid[node]);
+          const Real x = weight[0][i], y = weight[1][j], z = weight[2][k], dx = slope[0][i], dy = slope[1][j], dz = slope[2][k];
+          distance += c * x * y * z;
+          gradient += P{dx * y * z, x * dy * z, x * y * dz} * c;
+          change += P{curve[i] * y * z * along[0] + dx * dy * z * along[1] + dx * y * dz * along[2],
+                      dx * dy * z * along[0] + x * curve[j] * z * along[1] + x * dy * dz * along[2],
+                      dx * y * dz * along[0] + x * dy * dz * along[1] + x * y * curve[k] * along[2]} *
+                    c;
+        }
+    const Real steep = std::sqrt(dot(gradient, gradient)) / size[0], scale = steep > Real(1e-3) ? 1 / steep : Real(1e3);
+    const P normal = gradient * (scale / size[0]);
+    return {normal, distance + std::sqrt(beyond) * size[0], across(change, normal) * (scale / (size[0] * size[0]))};
   }
 
   // Half extents of a box around a tool in its local frame, and that box's centre.
@@ -155,6 +200,9 @@ struct Geometry {
       case cpdeform::rolling_pin:
         half[0] = half[2] = size[0];
         half[1] = Real(0.5) * size[1] + size[0];
+        return;
+      case cpdeform::mesh:
+        for (int a = 0; a < 3; ++a) half[a] = Real(0.5) * size[0] * (size[1 + a] - 1);
         return;
     }
     cpdeform::throw_unknown_tool(kind);
