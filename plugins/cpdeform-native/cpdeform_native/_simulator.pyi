@@ -35,7 +35,7 @@ class Scene:
         scale: Sequence[float],
         lower: Sequence[float],
         upper: Sequence[float],
-        grid: NDArray[np.float64] | None = None,
+        grid: NDArray[Any] | None = None,
     ) -> None: ...
 
 class CheckpointsFloat:
