@@ -109,6 +109,7 @@ def test_a_copys_distance_is_that_of_the_primitive(tmp_path: Path, name: str) ->
     assert float((found - expected)[near].abs().max()) < 1e-3
     assert float((gradient * normal).sum(dim=-1)[near].quantile(0.05)) > 0.99
     assert copy.volume == pytest.approx(shape.volume, rel=0.01)
+    assert float((copy.quick_distance(*points.unbind(-1)) - found)[expected < 0.02].abs().max()) < 5e-4
     far = expected > 0.03
     assert bool((found[far] > 0.02).all())
     assert torch.allclose(copy.half_extents(torch.eye(3, dtype=torch.float64)), torch.as_tensor(0.5 * mesh.extents))
