@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 COMMENTS = {
-    "position": "middle; y is up, the floor is at 0",
+    "position": "middle; y is up, clay rests at a height of 0.047",
     "widths": "edges",
     "particle_count": "more particles take finer shapes and more time",
     "friction": "against the clay; 0 slips",
@@ -63,5 +63,5 @@ def _entry(fields: dict[str, Any]) -> list[str]:
         text = f"{key}: {json.dumps(value) if isinstance(value, (str, list)) else value}"
         mark = "    - " if not lines else "      "
         comment = COMMENTS.get(key)
-        lines.append(f"{mark}{text:<44}# {comment}" if comment else f"{mark}{text}")
+        lines.append(f"{mark}{text:<56}  # {comment}" if comment else f"{mark}{text}")
     return lines

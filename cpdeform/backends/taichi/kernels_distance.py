@@ -110,18 +110,20 @@ def build_distance(real: Any) -> SimpleNamespace:
         steep = ti.max(ti.sqrt(gradient.dot(gradient)) / size[0], real(1e-3))
         normal = gradient / (steep * size[0])
         distance += ti.sqrt(ox * ox + oy * oy + oz * oz) * size[0]
-        return normal, distance, project(change, normal) / (steep * size[0] * size[0])
+        return normal, distance, project(change, normal) / (steep * size[0] * size[0]), steep
 
     @ti.func
     def surface(values: ti.template(), first, kind, size, p, g):
-        """Normal and signed distance at the local point p, and how the normal changes along g, as (normal, distance, bend).
+        """Normal and signed distance at the local point p, and how the normal changes along g: (normal, distance, bend, steepness).
 
         All that kernels know of a kind. The derivative of a distance's gradient is a symmetric matrix, the distance's Hessian, so
-        that `bend` is the adjoint of the normal, too; where it is not used, the compiler leaves it out.
+        that `bend` is the adjoint of the normal, too; where it is not used, the compiler leaves it out. The steepness is the
+        length of the distance's gradient, which is not 1 near the edges of a mesh's interpolated distance.
         """
         distance = real(zero)
         normal = vec3(zero, one, zero)
         bend = vec3(zero, zero, zero)
+        steepness = real(one)
         if kind == SPHERE:
             r = length(p)
             distance = r - size[0]
@@ -187,8 +189,8 @@ def build_distance(real: Any) -> SimpleNamespace:
             normal = q / s
             bend = project(moved, normal) / s
         if kind == MESH:
-            normal, distance, bend = mesh_surface(values, first, size, p, g)
-        return normal, distance, bend
+            normal, distance, bend, steepness = mesh_surface(values, first, size, p, g)
+        return normal, distance, bend, steepness
 
     @ti.func
     def pose_position(pose):

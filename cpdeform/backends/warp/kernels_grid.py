@@ -58,7 +58,7 @@ def build_grid(real: Any) -> SimpleNamespace:
         """A node's velocity after contact with one tool."""
         local = rotate(before[3], -pose_axis(before), node - pose_position(before))
         centre = part_centre(tool.kind, tool.size, before[7], local)
-        local_normal, distance, _ = surface(
+        local_normal, distance, _bend, _steepness = surface(
             parameters.grids, tool.grid_first, tool.kind, tool.size, local - centre, vec3(zero, zero, zero)
         )
         k = influence(parameters, distance)
@@ -93,7 +93,7 @@ def build_grid(real: Any) -> SimpleNamespace:
         """Gradient with respect to the velocity before contact; adds those of both poses to `grad_pose`."""
         local = rotate(before[3], -pose_axis(before), node - pose_position(before))
         centre = part_centre(tool.kind, tool.size, before[7], local)
-        local_normal, distance, _ = surface(
+        local_normal, distance, _bend, steepness = surface(
             parameters.grids, tool.grid_first, tool.kind, tool.size, local - centre, vec3(zero, zero, zero)
         )
         k = influence(parameters, distance)
@@ -140,11 +140,11 @@ def build_grid(real: Any) -> SimpleNamespace:
             gl = rotate(after[3], -pose_axis(after), gvc) - rotate(before[3], -pose_axis(before), gvc)
             # normal and influence
             gq_before += rotate_adjoint(before[3], pose_axis(before), local_normal, gn)
-            _normal, _distance, gs = surface(
+            _normal, _distance, gs, _steepness = surface(
                 parameters.grids, tool.grid_first, tool.kind, tool.size, local - centre, rotate(before[3], -pose_axis(before), gn)
             )
             if parameters.softness > zero and distance > zero:
-                gs -= (gk * parameters.softness * k) * local_normal
+                gs -= (gk * parameters.softness * k * steepness) * local_normal
             gl += gs
             gap = zero
             if tool.kind == wp.static(CHOPSTICKS):

@@ -13,13 +13,13 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.meshes.mesh import Array, Mesh
 from cpdeform.core.reading.arrays import open_arrays
 
-RESOLUTION = 48
+RESOLUTION = 80
 """Cells along the longest edge of a mesh's box."""
 
 MARGIN_CELLS = 6
 """Cells of the grid beyond the box on each side; farther away distances are continued."""
 
-MOST_NODES = 160
+MOST_NODES = 200
 """Nodes along an axis that a grid may have."""
 
 EXPECTED = "a shape file (.npz) as `cpdeform task new` and `write_shape` make it"

@@ -186,7 +186,7 @@ struct Contact {
     // normal and influence
     add_outer(gradient.rotation_before, gn, s.normal);
     P gs = G::surface(tool.kind, tool.size, tool.grid, local - centre, tool.rotation.transposed(gn)).bend;
-    if (softness > 0 && s.distance > 0) gs -= s.normal * (gk * softness * k);
+    if (softness > 0 && s.distance > 0) gs -= s.normal * (gk * softness * k * s.steepness);
     gl += gs;
     if (tool.kind == cpdeform::chopsticks) gradient.gap += Real(0.5) * (local.x >= 0 ? -gs.x : gs.x);
     // local = R^T (node - position)

@@ -62,6 +62,7 @@ struct Geometry {
     P normal;
     Real distance;
     P bend;
+    Real steepness = 1;  // length of the distance's gradient, which a mesh's interpolated one has near edges
   };
 
   CPDEFORM_INLINE static P across(const P& g, const P& normal) { return g - normal * dot(g, normal); }
@@ -169,7 +170,7 @@ struct Geometry {
         }
     const Real steep = std::sqrt(dot(gradient, gradient)) / size[0], scale = steep > Real(1e-3) ? 1 / steep : Real(1e3);
     const P normal = gradient * (scale / size[0]);
-    return {normal, distance + std::sqrt(beyond) * size[0], across(change, normal) * (scale / (size[0] * size[0]))};
+    return {normal, distance + std::sqrt(beyond) * size[0], across(change, normal) * (scale / (size[0] * size[0])), steep};
   }
 
   // Half extents of a box around a tool in its local frame, and that box's centre.
