@@ -97,7 +97,8 @@ def build_distance(real: Any) -> SimpleNamespace:
         curve = vec3(one, -two, one)
         distance = zero
         gradient = vec3(zero, zero, zero)
-        change = vec3(zero, zero, zero)
+        straight = vec3(zero, zero, zero)
+        mixed = vec3(zero, zero, zero)
         for n in range(27):
             i = n // 9
             j = (n // 3) % 3
@@ -107,15 +108,19 @@ def build_distance(real: Any) -> SimpleNamespace:
             xy, xz, yz = dx[i] * dy[j] * wz[k], dx[i] * wy[j] * dz[k], wx[i] * dy[j] * dz[k]
             distance += c * wx[i] * wy[j] * wz[k]
             gradient += c * vec3(dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k], wx[i] * wy[j] * dz[k])
-            change += c * vec3(
-                curve[i] * wy[j] * wz[k] * g[0] + xy * g[1] + xz * g[2],
-                xy * g[0] + wx[i] * curve[j] * wz[k] * g[1] + yz * g[2],
-                xz * g[0] + yz * g[1] + wx[i] * wy[j] * curve[k] * g[2],
-            )
+            straight += c * vec3(curve[i] * wy[j] * wz[k], wx[i] * curve[j] * wz[k], wx[i] * wy[j] * curve[k])
+            mixed += c * vec3(xy, xz, yz)
         steep = wp.max(wp.sqrt(wp.dot(gradient, gradient)) / size[0], real(1e-3))
         normal = gradient / (steep * size[0])
         distance += wp.sqrt(ox * ox + oy * oy + oz * oz) * size[0]
-        return normal, distance, project(change, normal) / (steep * size[0] * size[0]), steep
+        # The transposed derivative of the normal: an interpolated distance's Hessian does not vanish along the normal.
+        a = project(g, normal)
+        bend = vec3(
+            straight[0] * a[0] + mixed[0] * a[1] + mixed[1] * a[2],
+            mixed[0] * a[0] + straight[1] * a[1] + mixed[2] * a[2],
+            mixed[1] * a[0] + mixed[2] * a[1] + straight[2] * a[2],
+        )
+        return normal, distance, bend / (steep * size[0] * size[0]), steep
 
     @wp.func
     def surface(grids: wp.array(dtype=real), first: int, kind: int, size: vec4, p: vec3, g: vec3):

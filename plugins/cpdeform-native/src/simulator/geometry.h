@@ -133,7 +133,7 @@ struct Geometry {
   // The quadratic B-spline of a mesh's signed distance, its normalised gradient, and the change of that along g. Beyond the grid, the
   // distance at its nearest point and the way there.
   static Surface mesh_surface(const Real* size, const double* grid, const P& p, const P& g) {
-    const Real at[3] = {p.x, p.y, p.z}, along[3] = {g.x, g.y, g.z};
+    const Real at[3] = {p.x, p.y, p.z};
     Real weight[3][3], slope[3][3], beyond = 0;
     int count[3], base[3];
     for (int a = 0; a < 3; ++a) {
@@ -154,7 +154,7 @@ struct Geometry {
     }
     const Real curve[3] = {1, -2, 1};
     Real distance = 0;
-    P gradient, change;
+    P gradient, straight, mixed;
     for (int i = 0; i < 3; ++i)
       for (int j = 0; j < 3; ++j)
         for (int k = 0; k < 3; ++k) {
@@ -163,14 +163,16 @@ struct Geometry {
           const Real x = weight[0][i], y = weight[1][j], z = weight[2][k], dx = slope[0][i], dy = slope[1][j], dz = slope[2][k];
           distance += c * x * y * z;
           gradient += P{dx * y * z, x * dy * z, x * y * dz} * c;
-          change += P{curve[i] * y * z * along[0] + dx * dy * z * along[1] + dx * y * dz * along[2],
-                      dx * dy * z * along[0] + x * curve[j] * z * along[1] + x * dy * dz * along[2],
-                      dx * y * dz * along[0] + x * dy * dz * along[1] + x * y * curve[k] * along[2]} *
-                    c;
+          straight += P{curve[i] * y * z, x * curve[j] * z, x * y * curve[k]} * c;
+          mixed += P{dx * dy * z, dx * y * dz, x * dy * dz} * c;
         }
     const Real steep = std::sqrt(dot(gradient, gradient)) / size[0], scale = steep > Real(1e-3) ? 1 / steep : Real(1e3);
     const P normal = gradient * (scale / size[0]);
-    return {normal, distance + std::sqrt(beyond) * size[0], across(change, normal) * (scale / (size[0] * size[0])), steep};
+    // The transposed derivative of the normal: an interpolated distance's Hessian does not vanish along the normal.
+    const P a = across(g, normal);
+    const P bend = {straight.x * a.x + mixed.x * a.y + mixed.y * a.z, mixed.x * a.x + straight.y * a.y + mixed.z * a.z,
+                    mixed.y * a.x + mixed.z * a.y + straight.z * a.z};
+    return {normal, distance + std::sqrt(beyond) * size[0], bend * (scale / (size[0] * size[0])), steep};
   }
 
   // Half extents of a box around a tool in its local frame, and that box's centre.
