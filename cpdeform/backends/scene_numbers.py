@@ -17,7 +17,7 @@ KIND_NUMBERS = {kind: number for number, kind in enumerate(TOOLS)}
 
 SPHERE, CAPSULE, BOX = KIND_NUMBERS["Sphere"], KIND_NUMBERS["Capsule"], KIND_NUMBERS["Box"]
 CYLINDER, TORUS = KIND_NUMBERS["Cylinder"], KIND_NUMBERS["Torus"]
-ROLLING_PIN, CHOPSTICKS = KIND_NUMBERS["RollingPin"], KIND_NUMBERS["Chopsticks"]
+ROLLING_PIN, CHOPSTICKS, MESH = KIND_NUMBERS["RollingPin"], KIND_NUMBERS["Chopsticks"], KIND_NUMBERS["Mesh"]
 
 MOST_LENGTHS = 4
 """Lengths that kernels have room for in a tool's record."""
@@ -71,6 +71,7 @@ class ToolNumbers:
         scale: Motion per substep at action 1, padded to seven: length units, radians.
         lower: Its position is clipped to stay above this corner, length units.
         upper: Its position is clipped to stay below this corner, length units.
+        grid_first: Where its numbers begin in `tool_grids`; 0 for a tool without a grid.
     """
 
     kind: int
@@ -81,6 +82,7 @@ class ToolNumbers:
     scale: tuple[float, ...]
     lower: Vector3
     upper: Vector3
+    grid_first: int = 0
 
 
 def kind_number(tool: Tool) -> int:
@@ -131,7 +133,7 @@ def scene_numbers(scene: Scene) -> SceneNumbers:
 
 def tool_numbers(scene: Scene) -> list[ToolNumbers]:
     """The constants of a scene's tools."""
-    tools, offset = [], 0
+    tools, offset, first = [], 0, 0
     for tool in scene.tools:
         scale = [value / scene.substeps for value in tool.action_scale]
         tools.append(
@@ -144,10 +146,22 @@ def tool_numbers(scene: Scene) -> list[ToolNumbers]:
                 scale=(*scale, *[0.0] * (7 - len(scale))),
                 lower=tool.lower_bound,
                 upper=tool.upper_bound,
+                grid_first=first,
             )
         )
         offset += tool.action_size
+        grid = tool.kernel_grid
+        first += 0 if grid is None else grid.size
     return tools
+
+
+def tool_grids(scene: Scene) -> NDArray[np.float64]:
+    """The numbers (K,) of all tools' grids, see `ToolBase.kernel_grid`, one after the other; a single 0 where there are none."""
+    grids = [tool.kernel_grid for tool in scene.tools]
+    return np.concatenate(
+        [np.zeros(1) if not any(grid is not None for grid in grids) else np.zeros(0)]
+        + [grid.reshape(-1) for grid in grids if grid is not None]
+    )
 
 
 def material_numbers(scene: Scene) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""`cpdeform task`: checks of tasks, and files that they are made of."""
+"""`cpdeform task`: new tasks, their pictures and checks, and files that they are made of."""
 
 from __future__ import annotations
 
@@ -9,18 +9,22 @@ import typer
 
 from cpdeform.cli.task_check import task_check_command
 from cpdeform.cli.task_generate import generate_command
+from cpdeform.cli.task_new import new_command
+from cpdeform.cli.task_show import show_command
 
 if TYPE_CHECKING:
     from cpdeform.tasks.grid_import import ImportedGrid
 
-task = typer.Typer(no_args_is_help=True, help="Check tasks, and make files that they are made of.")
+task = typer.Typer(no_args_is_help=True, help="Make tasks, look at them, check them, and make files that they are made of.")
 
 
 @task.callback()
 def task_group() -> None:
-    """Check tasks, and make files that they are made of."""
+    """Make tasks, look at them, check them, and make files that they are made of."""
 
 
+task.command("new")(new_command)
+task.command("show")(show_command)
 task.command("check")(task_check_command)
 
 

@@ -62,6 +62,29 @@ def load_goal(path: Path, *, scene: Scene, limits: ReadingLimits | None = None) 
     return positions
 
 
+def write_goal_points(path: Path, position: NDArray[np.float64], *, scene: Scene) -> None:
+    """Write a goal file of points (M, 3) that lie in a scene's domain, length units.
+
+    Raises:
+        InputError: The points are not finite (M, 3) or not in the domain, or the file cannot be written.
+    """
+    if path.suffix != ".npz":
+        raise InputError("path", came=str(path), expected="a file name that ends in .npz")
+    if position.ndim != 2 or position.shape[1:] != (3,) or not len(position) or not np.isfinite(position).all():
+        raise InputError("points", came=f"shape {position.shape}", expected="finite positions (M, 3), M >= 1")
+    lower, upper = (np.asarray(corner) for corner in scene.domain)
+    outside = int(((position < lower - 1e-4) | (position > upper + 1e-4)).any(axis=1).sum())
+    if outside:
+        came = f"{outside} of {len(position)} points outside the domain"
+        raise InputError("points", came=came, expected=f"positions within {scene.domain[0]} and {scene.domain[1]}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_goal(path, np.clip(position, lower, upper))
+    except OSError as error:
+        came = f"a path that cannot be written ({error.strerror or error})"
+        raise InputError(f"goal file {path}", came=came, expected="a writable path") from error
+
+
 def load_goal_grid(path: Path, *, scene: Scene, limits: ReadingLimits | None = None) -> NDArray[np.float64] | None:
     """Read the node masses of a goal file: arrays ``grid_cells`` (K, 3), node indices, and ``grid_mass`` (K,).
 

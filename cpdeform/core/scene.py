@@ -30,6 +30,7 @@ from cpdeform.core.shapes.box import BodyBox, ToolBox
 from cpdeform.core.shapes.chopsticks import ToolChopsticks
 from cpdeform.core.shapes.cylinder import ToolCylinder
 from cpdeform.core.shapes.kinds import Body, Tool
+from cpdeform.core.shapes.mesh import BodyMesh, ToolMesh
 from cpdeform.core.shapes.rod import ToolCapsule, ToolRod, ToolRollingPin
 from cpdeform.core.shapes.sphere import BodySphere, ToolSphere
 from cpdeform.core.shapes.tool import ToolBase
@@ -40,6 +41,7 @@ __all__ = [
     "Body",
     "BodyBase",
     "BodyBox",
+    "BodyMesh",
     "BodySphere",
     "FrozenModel",
     "Material",
@@ -53,6 +55,7 @@ __all__ = [
     "ToolCapsule",
     "ToolChopsticks",
     "ToolCylinder",
+    "ToolMesh",
     "ToolRod",
     "ToolRollingPin",
     "ToolSphere",
@@ -142,6 +145,11 @@ class Scene(FrozenModel):
         """Corners that particle positions are clipped to, length units."""
         upper = 1.0 - WALL_NODES * self.node_distance
         return (0.0, self.ground_height, 0.0), (upper, upper, upper)
+
+    @property
+    def resting_height(self) -> float:
+        """Height that clay comes to rest at, length units: the top of the floor's boundary layer, whose nodes let nothing sink."""
+        return (WALL_NODES + int(self.ground_height / self.node_distance)) * self.node_distance
 
     @property
     def gravity(self) -> Vector3:

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from cpdeform.core.bounded import MOST_STAGES, MOST_STEPS, Name, Whole
 from cpdeform.core.errors import InputError, PluginError, UnknownNameError
-from cpdeform.core.goal import load_correspondence, load_goal, load_goal_grid
+from cpdeform.core.goal import load_correspondence, load_goal, load_goal_grid, write_goal_points
 from cpdeform.core.old_names import current_scene, current_task
 from cpdeform.core.plugins import Registry, describe, load_registry, redirect_prints
 from cpdeform.core.reading.models import validate
@@ -65,6 +65,60 @@ class Task(FrozenModel):
     @classmethod
     def _take_old_names(cls, content: Any) -> Any:
         return current_task(content)
+
+    @classmethod
+    def from_points(
+        cls, points: ArrayLike, *, scene: Scene | str, path: Path | str, name: str | None = None, **fields: Any
+    ) -> Task:
+        """A task whose goal is a cloud of points.
+
+        Args:
+            points: Goal particles (M, 3) in the scene's domain, length units; M need not be the clay's number of particles.
+            scene: The scene, or the name of a task that has it.
+            path: The goal file (.npz) to write.
+            name: Name of the task; defaults to the file's.
+            fields: Other fields of `Task`, such as ``step_count``.
+
+        Raises:
+            InputError: The points are not finite (M, 3) or not in the domain, or a field does not fit.
+        """
+        found, path = load_task(scene).scene if isinstance(scene, str) else scene, Path(path)
+        write_goal_points(path, np.asarray(points, dtype=np.float64), scene=found)
+        content = {"name": name or path.stem, "scene": found, "goal": path, **fields}
+        return validate(cls, content, source=f"task {content['name']}")
+
+    @classmethod
+    def from_mesh(
+        cls,
+        mesh: Path | str,
+        *,
+        scene: Scene | str,
+        path: Path | str,
+        up: Literal["x", "y", "z"] | None = None,
+        name: str | None = None,
+        **fields: Any,
+    ) -> Task:
+        """A task whose goal is the shape of a mesh: scaled to the clay's volume, standing where the clay is, filled evenly.
+
+        Args:
+            mesh: An STL, OBJ, PLY or GLB file; see `cpdeform.core.meshes.reading.read_mesh` for what is repaired and what refused.
+            scene: The scene, or the name of a task that has it.
+            path: The goal file (.npz) to write.
+            up: The axis that points upwards in the mesh's file; defaults to z for STL and PLY, y for OBJ and GLB.
+            name: Name of the task; defaults to the goal file's.
+            fields: Other fields of `Task`, such as ``step_count``.
+
+        Raises:
+            InputError: The mesh cannot be used, or does not fit into the domain at the clay's volume.
+            MissingExtraError: The extra `meshes` is not installed.
+        """
+        from cpdeform.core.meshes.goal import mesh_goal
+        from cpdeform.core.meshes.reading import read_mesh
+
+        found = load_task(scene).scene if isinstance(scene, str) else scene
+        shape, _ = read_mesh(Path(mesh), up=up)
+        points = mesh_goal(shape, found, argument=f"mesh {mesh}")
+        return cls.from_points(points, scene=found, path=path, name=name, **fields)
 
     @property
     def rollout_steps(self) -> int:
@@ -178,9 +232,25 @@ def read_task(path: Path, *, variant: str | None = None) -> Task:
         content = merge(content, variants[variant])
         content["name"] = f"{base}-{variant}"
     content.setdefault("name", base)
-    if isinstance(content.get("goal"), str):
-        content["goal"] = path.parent / content["goal"]
-    return validate(Task, content, source=f"task file {path}")
+    return validate(Task, beside(content, path.parent), source=f"task file {path}")
+
+
+def beside(content: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Fields of a task whose files, where they are relative, lie in a folder: the goal's, and those of shapes from meshes."""
+    result = dict(content)
+    if isinstance(result.get("goal"), str):
+        result["goal"] = folder / result["goal"]
+    if isinstance(result.get("scene"), Mapping):
+        scene = dict(result["scene"])
+        for name in ("bodies", "tools"):
+            if isinstance(scene.get(name), (list, tuple)):
+                scene[name] = [_shape_beside(item, folder) for item in scene[name]]
+        result["scene"] = scene
+    return result
+
+
+def _shape_beside(item: Any, folder: Path) -> Any:
+    return {**item, "file": folder / item["file"]} if isinstance(item, Mapping) and isinstance(item.get("file"), str) else item
 
 
 def limited_task(task: Task) -> Task:

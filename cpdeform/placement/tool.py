@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.rotation import rotate
-from cpdeform.core.scene import Tool
+from cpdeform.core.scene import Tool, ToolMesh
 from cpdeform.core.shapes.tool import shape_of
 from cpdeform.core.signed_distance import local_distance
 
@@ -38,6 +38,8 @@ def surface_points(tool: Tool, *, resolution: int = 12) -> Tensor:
     Returns:
         Points (P, 3) in the tool's local frame, float64, length units, P at most resolution^3.
     """
+    if isinstance(tool, ToolMesh):
+        return torch.as_tensor(tool.shape().surface(rows=resolution, columns=resolution).reshape(-1, 3))
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     half = 1.1 * tool_half_extents(tool, identity)
     lattice = torch.cartesian_prod(*(torch.linspace(-float(edge), float(edge), resolution, dtype=torch.float64) for edge in half))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cpdeform.core.rotation import rotate_inverse
 from cpdeform.core.scene import Tool
-from cpdeform.core.signed_distance import local_distance
+from cpdeform.core.shapes.tool import shape_of
 from cpdeform.placement.tool import tool_half_extents
 
 CHUNK_DISTANCES = 2**18
@@ -43,12 +43,12 @@ def reduce_distances(
     Returns:
         Numbers (G,).
     """
-    local_points = rotate_inverse(quaternion, points).unbind(-1)
+    shape, local_points = shape_of(tool), rotate_inverse(quaternion, points).unbind(-1)
     step = max(1, CHUNK_DISTANCES // max(1, points.shape[0]))
     parts = []
     for chunk in torch.split(rotate_inverse(quaternion, positions), step):
         axes = [point - origin.unsqueeze(-1) for point, origin in zip(local_points, chunk.unbind(-1), strict=True)]
-        parts.append(reduction(local_distance(tool, *axes)))
+        parts.append(reduction(shape.quick_distance(*axes)))
     return torch.cat(parts) if parts else positions.new_empty(0)
 
 

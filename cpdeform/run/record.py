@@ -52,6 +52,7 @@ from cpdeform.run.record_files import (
 )
 from cpdeform.run.record_lock import RecordLock
 from cpdeform.run.record_reader import RunRecord, load_record
+from cpdeform.run.record_shapes import keep_shapes
 from cpdeform.run.record_stage import write_stage
 
 __all__ = ["RunRecord", "RunRecorder", "load_record", "save_result"]
@@ -126,6 +127,7 @@ class RunRecorder(Observer):
             check_directory(self.directory, overwrite=self._overwrite)
             for path in own_files(self.directory):
                 path.unlink()
+            content = task.model_dump(mode="json")
             self._run = {
                 "format": FORMAT,
                 "status": "running",
@@ -140,7 +142,7 @@ class RunRecorder(Observer):
                 "configuration": self._configuration.model_dump(mode="json") if self._configuration else None,
                 "origins": None if self._origins is None else dict(self._origins),
                 # The goal is the copy beside this file.
-                "task": {**task.model_dump(mode="json"), "goal": GOAL_FILE},
+                "task": {**content, "scene": keep_shapes(content["scene"], self.directory), "goal": GOAL_FILE},
             }
             with replacing_hdf5(self.directory / GOAL_FILE) as file:
                 write_dataset(file, "position", goal, shape="particle, xyz", units="length (domain edge = 1)")

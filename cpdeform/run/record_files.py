@@ -27,6 +27,7 @@ OLD_GOAL_FILE = "target.h5"
 """What it was called up to format 2."""
 
 STAGE_PATTERN = re.compile(r"stage-(\d{3,})\.h5")
+SHAPE_PATTERN = re.compile(r"shape-[0-9a-f]{16}\.npz")
 PICTURE_FILES = ("picture.png", "sheet.png", "curves.png", "animation.mp4", "animation.gif", "report.html")
 OWN_FILES = (RUN_FILE, METRICS_FILE, GOAL_FILE, OLD_GOAL_FILE, *PICTURE_FILES)
 """Files, besides the stages', that `overwrite` may remove; pictures are among them since they would show the old run."""
@@ -51,7 +52,7 @@ def own_files(directory: Path) -> list[Path]:
 
 def _is_own(name: str) -> bool:
     plain = name[1:].replace(".tmp.", ".") if name.startswith(".") else name
-    return plain in OWN_FILES or STAGE_PATTERN.fullmatch(plain) is not None
+    return plain in OWN_FILES or any(pattern.fullmatch(plain) for pattern in (STAGE_PATTERN, SHAPE_PATTERN))
 
 
 ATTEMPTS_TO_WRITE = 10

@@ -18,7 +18,7 @@ from cpdeform.core.reading.json_text import read_json, read_json_lines
 from cpdeform.core.reading.limits import ReadingLimits, default_limits
 from cpdeform.core.reading.models import validate
 from cpdeform.core.state import State
-from cpdeform.core.task import Task
+from cpdeform.core.task import Task, beside
 from cpdeform.planning.result import StageResult
 from cpdeform.run.migration import current_task, goal_file
 from cpdeform.run.record_files import METRICS_FILE, RUN_FILE, stage_files
@@ -100,7 +100,7 @@ def load_record(directory: Path | str, *, limits: ReadingLimits | None = None) -
     argument = f"run record {directory}"
     run = _read_run(directory)
     content = current_task(run["task"], record_format=run.get("format", 1))
-    task = validate(Task, content, source=f"{argument}: task")
+    task = validate(Task, beside(content, directory), source=f"{argument}: task")
     # The goal is the record's own copy, wherever the record lies now.
     own = goal_file(directory)
     task = task.model_copy(update={"goal": own})

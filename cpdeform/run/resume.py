@@ -18,6 +18,7 @@ from cpdeform.core.task import Task, changed_task, limited_task, merge, validate
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.migration import current_configuration
 from cpdeform.run.record_reader import RunRecord
+from cpdeform.run.record_shapes import scene_content
 
 OPTIONS_OF = {
     "backend": ("simulator_options",),
@@ -91,11 +92,11 @@ def check_same_task(record: RunRecord, asked: Task) -> None:
     if asked.name != record.task.name:
         expected = f'"{record.task.name}", the task of run record {record.directory}'
         raise InputError("TASK", came=f'"{asked.name}"', expected=expected, remedy=remedy)
-    recorded = record.task.model_dump()
+    recorded = _content(record.task)
     changes = recorded_configuration(record)
     # Whether the limits were in force is the strategy's business, which the record does not know.
     tasks = [
-        changed_task(task, scene=changes.scene, step_count=changes.steps, rest_steps=changes.rest_steps).model_dump()
+        _content(changed_task(task, scene=changes.scene, step_count=changes.steps, rest_steps=changes.rest_steps))
         for task in (limited_task(asked), asked)
     ]
     given = next((task for task in tasks if task["scene"] == recorded["scene"]), tasks[0])
@@ -106,3 +107,7 @@ def check_same_task(record: RunRecord, asked: Task) -> None:
     if different:
         came = f'"{asked.name}" with another {", ".join(different)}'
         raise InputError("TASK", came=came, expected=f"the task as it is in run record {record.directory}", remedy=remedy)
+
+
+def _content(task: Task) -> dict[str, Any]:
+    return {**task.model_dump(exclude={"scene"}), "scene": scene_content(task.scene)}

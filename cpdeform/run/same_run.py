@@ -7,6 +7,7 @@ import torch
 from cpdeform.core.task import Task
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record_reader import RunRecord
+from cpdeform.run.record_shapes import scene_content
 from cpdeform.run.resume import recorded_configuration
 
 SAME_GOAL = 1e-6
@@ -39,7 +40,9 @@ def _same_task(record: RunRecord, configuration: RunConfiguration, task: Task) -
     stages = recorded_configuration(record).stages or record.task.stage_count
     if stages != (configuration.stages or task.stage_count) or record.run.get("resumed_from") is not None:
         return False
-    if any(getattr(record.task, name) != getattr(task, name) for name in ("name", "scene", "step_count", "rest_steps", "metric")):
+    if any(getattr(record.task, name) != getattr(task, name) for name in ("name", "step_count", "rest_steps", "metric")):
+        return False
+    if scene_content(record.task.scene) != scene_content(task.scene):
         return False
     goal = torch.as_tensor(task.load_goal()).to(record.goal)
     return goal.shape == record.goal.shape and torch.allclose(goal, record.goal, rtol=0.0, atol=SAME_GOAL)

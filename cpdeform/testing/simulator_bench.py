@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -43,6 +44,8 @@ EXAMPLES: dict[str, dict[str, Any]] = {
         "rotation_wxyz": (1.0, 0.0, 0.0, 0.0),
         "action_scale": (0.02, 0.02, 0.02, 0.04, 0.04, 0.04, 0.02),
     },
+    # an ellipsoid of the half axes 0.03, 0.02 and 0.04, the inside of an icosphere
+    "Mesh": {"file": str(Path(__file__).with_name("ellipsoid.npz")), "position": (0.5, 0.128, 0.49)},
 }
 """One tool of each kind, in touch with the block of `resting`."""
 

@@ -10,6 +10,7 @@ import torch
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.goal import load_correspondence, load_goal, load_goal_grid, write_goal
+from cpdeform.core.meshes.filling import fill_evenly
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.sampling import sample_particles
 from cpdeform.core.task import load_task
@@ -18,7 +19,7 @@ from cpdeform.planning.objectives.mass import mass_grid
 from cpdeform.planning.objectives.metrics import incremental_iou
 from cpdeform.run.evaluation import evaluate, evaluate_record, exact_wasserstein, paper_wasserstein, sampling_floor
 from cpdeform.run.record import RunRecorder, load_record
-from cpdeform.tasks.solids import Block, Solid, fill_evenly
+from cpdeform.tasks.solids import Block, Solid
 
 needs_geomloss = pytest.mark.skipif(importlib.util.find_spec("geomloss") is None, reason="GeomLoss is not installed")
 needs_pot = pytest.mark.skipif(importlib.util.find_spec("ot") is None, reason="POT is not installed")

@@ -23,7 +23,7 @@ from cpdeform.core.task import Task, list_variants, read_task, task_path
 from cpdeform.run.checks.bodies import check_near_bodies, gap
 from cpdeform.run.checks.check import check_task, check_tools, warn_about_tools
 from cpdeform.run.checks.finding import Finding
-from cpdeform.run.checks.goal_height import check_goal_below_floor, check_goal_floating, floor_height
+from cpdeform.run.checks.goal_height import check_goal_below_floor, check_goal_floating
 from cpdeform.run.checks.goal_reach import check_goal_reach
 from cpdeform.run.checks.goal_volume import check_goal_volume
 from cpdeform.run.checks.occupancy import filled_volume, filling_radius
@@ -235,8 +235,8 @@ def test_clay_comes_to_rest_at_the_floors_height() -> None:
     scene = scene_with(bodies=[{**BLOCK, "position": (0.5, 0.12, 0.5)}])
     simulator = SimulatorWarp(scene, device="cpu")
     height = float(simulator.rollout(simulator.initial_state(), torch.zeros(1, 60, 0)).positions[0, -1, :, 1].min())
-    assert floor_height(scene) == pytest.approx(0.047, abs=1e-3)
-    assert height == pytest.approx(floor_height(scene), abs=0.5 / 64)
+    assert scene.resting_height == pytest.approx(0.047, abs=1e-3)
+    assert height == pytest.approx(scene.resting_height, abs=0.5 / 64)
 
 
 def test_a_floating_goal_needs_something_to_hold_it() -> None:

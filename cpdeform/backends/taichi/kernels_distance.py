@@ -1,19 +1,19 @@
-"""Signed distances of the tools in their local frames, outward normals, and the derivative of the normals.
+"""Signed distances of the tools in their local frames, outward normals, and how these change.
 
 The entries of a tool's `size`, lengths: Sphere (radius); Capsule, RollingPin and Chopsticks (radius, height); Box (half extents,
-rounding); Cylinder (radius, half height); Torus (major radius, tube radius). Chopsticks are the capsule nearer to a point:
-`part_centre` is its centre.
+rounding); Cylinder (radius, half height); Torus (major radius, tube radius); Mesh (distance between nodes, numbers of nodes;
+its numbers are in `values` from `grid_first` on). Chopsticks are the capsule nearer to a point: `part_centre` is its centre.
 """
 
 import functools
 from types import SimpleNamespace
 from typing import Any
 
-from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, ROLLING_PIN, SPHERE, TORUS
+from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, MESH, ROLLING_PIN, SPHERE, TORUS
 from cpdeform.backends.taichi.kernels_types import build_types
 from cpdeform.backends.taichi.runtime import ti
 
-TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks", "Mesh")
 """The kinds of tools that the functions below know; the simulator refuses others."""
 
 
@@ -22,7 +22,7 @@ def build_distance(real: Any) -> SimpleNamespace:
     """Taichi functions of signed distances and rotations for one scalar type."""
     types = build_types(real)
     vec3, vec4 = types.vec3, types.vec4
-    zero, half, one, two = 0.0, 0.5, 1.0, 2.0
+    zero, half, three_quarters, one, two = 0.0, 0.5, 0.75, 1.0, 2.0
     # PlasticineLab's length: finite gradient at zero
     length_regularization = 1e-8
 
@@ -66,29 +66,98 @@ def build_distance(real: Any) -> SimpleNamespace:
         return result
 
     @ti.func
-    def distance_and_normal(kind, size, p):
-        """Signed distance and outward normal at the local point p, as (normal, distance)."""
+    def project(g, normal):
+        return g - g.dot(normal) * normal
+
+    @ti.func
+    def spline(f):
+        """Weights of a quadratic B-spline at three nodes, `f` from the middle one, and their derivatives."""
+        weights = vec3(half * (half - f) * (half - f), three_quarters - f * f, half * (half + f) * (half + f))
+        return weights, vec3(f - half, -two * f, f + half)
+
+    @ti.func
+    def mesh_place(along, size, count):
+        """Where a coordinate lies in the grid: clipped, its nearest node, and how far it is beyond, in nodes."""
+        u = along / size + half * (count - one)
+        inside = ti.min(ti.max(u, one), count - two)
+        base = ti.min(ti.cast(inside + half, ti.i32), ti.cast(count, ti.i32) - 2)
+        return inside - ti.cast(base, real), base, u - inside
+
+    @ti.func
+    def mesh_surface(values: ti.template(), first, size, p, g):
+        """As `surface`, of a mesh: the quadratic B-spline of its distance; beyond the grid the way there is added."""
+        fx, bx, ox = mesh_place(p[0], size[0], size[1])
+        fy, by, oy = mesh_place(p[1], size[0], size[2])
+        fz, bz, oz = mesh_place(p[2], size[0], size[3])
+        wx, dx = spline(fx)
+        wy, dy = spline(fy)
+        wz, dz = spline(fz)
+        curve = vec3(one, -two, one)
+        distance = real(zero)
+        gradient = vec3(zero, zero, zero)
+        straight = vec3(zero, zero, zero)
+        mixed = vec3(zero, zero, zero)
+        for i, j, k in ti.static(ti.ndrange(3, 3, 3)):
+            node = ((bx + i - 1) * ti.cast(size[2], ti.i32) + by + j - 1) * ti.cast(size[3], ti.i32) + bz + k - 1
+            c = values[first + node]
+            xy, xz, yz = dx[i] * dy[j] * wz[k], dx[i] * wy[j] * dz[k], wx[i] * dy[j] * dz[k]
+            distance += c * wx[i] * wy[j] * wz[k]
+            gradient += c * vec3(dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k], wx[i] * wy[j] * dz[k])
+            straight += c * vec3(curve[i] * wy[j] * wz[k], wx[i] * curve[j] * wz[k], wx[i] * wy[j] * curve[k])
+            mixed += c * vec3(xy, xz, yz)
+        steep = ti.max(ti.sqrt(gradient.dot(gradient)) / size[0], real(1e-3))
+        normal = gradient / (steep * size[0])
+        distance += ti.sqrt(ox * ox + oy * oy + oz * oz) * size[0]
+        # The transposed derivative of the normal: an interpolated distance's Hessian does not vanish along the normal.
+        a = project(g, normal)
+        bend = vec3(
+            straight[0] * a[0] + mixed[0] * a[1] + mixed[1] * a[2],
+            mixed[0] * a[0] + straight[1] * a[1] + mixed[2] * a[2],
+            mixed[1] * a[0] + mixed[2] * a[1] + straight[2] * a[2],
+        )
+        return normal, distance, bend / (steep * size[0] * size[0]), steep
+
+    @ti.func
+    def surface(values: ti.template(), first, kind, size, p, g):
+        """Normal and signed distance at the local point p, and how the normal changes along g: (normal, distance, bend, steepness).
+
+        All that kernels know of a kind. The derivative of a distance's gradient is a symmetric matrix, the distance's Hessian, so
+        that `bend` is the adjoint of the normal, too; where it is not used, the compiler leaves it out. The steepness is the
+        length of the distance's gradient, which is not 1 near the edges of a mesh's interpolated distance.
+        """
         distance = real(zero)
         normal = vec3(zero, one, zero)
+        bend = vec3(zero, zero, zero)
+        steepness = real(one)
         if kind == SPHERE:
             r = length(p)
             distance = r - size[0]
             normal = p / r
+            bend = project(g, normal) / r
         if kind == CAPSULE or kind == ROLLING_PIN or kind == CHOPSTICKS:
             h = half * size[1]
             q = vec3(p[0], p[1] - ti.min(ti.max(p[1], -h), h), p[2])
+            moved = g
+            if ti.abs(p[1]) < h:
+                moved[1] = zero
             r = length(q)
             distance = r - size[0]
             normal = q / r
+            bend = project(moved, normal) / r
         if kind == BOX:
             b = vec3(size[0], size[1], size[2])
             q = ti.abs(p) - b
             largest = q.max()
             if largest > zero:
                 o = box_offset(p, b)
+                moved = g
+                for a in ti.static(range(3)):
+                    if q[a] <= zero:
+                        moved[a] = zero
                 r = ti.sqrt(o.dot(o))
                 distance = r - size[3]
                 normal = o / r
+                bend = project(moved, normal) / r
             else:
                 distance = largest - size[3]
                 axis = largest_axis(q)
@@ -98,76 +167,35 @@ def build_distance(real: Any) -> SimpleNamespace:
                         normal[a] = sign(p[a])
         if kind == CYLINDER:
             u, r = radial_unit(p)
+            turn = project(vec3(g[0], zero, g[2]), u) / r
             side = r - size[0]
             top = ti.abs(p[1]) - size[1]
             up = vec3(zero, sign(p[1]), zero)
             if side > zero and top > zero:
                 distance = ti.sqrt(side * side + top * top)
                 normal = (side / distance) * u + (top / distance) * up
+                moved_side = g.dot(u)
+                moved_top = g.dot(up)
+                moved = moved_side * u + moved_top * up + side * turn
+                bend = (moved - (side * moved_side + top * moved_top) / distance * normal) / distance
             else:
                 distance = ti.max(side, top)
                 normal = up
                 if side > top:
                     normal = u
+                    bend = turn
         if kind == TORUS:
             u, r = radial_unit(p)
-            q = (r - size[0]) * u + vec3(zero, p[1], zero)
+            side = r - size[0]
+            q = side * u + vec3(zero, p[1], zero)
+            moved = g.dot(u) * u + side / r * project(vec3(g[0], zero, g[2]), u) + vec3(zero, g[1], zero)
             s = length(q)
             distance = s - size[1]
             normal = q / s
-        return normal, distance
-
-    @ti.func
-    def project(g, normal):
-        return g - g.dot(normal) * normal
-
-    @ti.func
-    def normal_adjoint(kind, size, p, g):
-        """(d normal / d p)^T g; the derivative is a symmetric matrix, the distance's Hessian."""
-        result = vec3(zero, zero, zero)
-        if kind == SPHERE:
-            r = length(p)
-            result = project(g, p / r) / r
-        if kind == CAPSULE or kind == ROLLING_PIN or kind == CHOPSTICKS:
-            h = half * size[1]
-            q = vec3(p[0], p[1] - ti.min(ti.max(p[1], -h), h), p[2])
-            r = length(q)
-            result = project(g, q / r) / r
-            if ti.abs(p[1]) < h:
-                result[1] = zero
-        if kind == BOX:
-            b = vec3(size[0], size[1], size[2])
-            q = ti.abs(p) - b
-            if q.max() > zero:
-                o = box_offset(p, b)
-                r = ti.sqrt(o.dot(o))
-                result = project(g, o / r) / r
-                for axis in ti.static(range(3)):
-                    if q[axis] <= zero:
-                        result[axis] = zero
-        if kind == CYLINDER:
-            u, r = radial_unit(p)
-            side = r - size[0]
-            top = ti.abs(p[1]) - size[1]
-            around = vec3(-u[2], zero, u[0])
-            turn = g.dot(around) / r * around
-            if side > zero and top > zero:
-                d = ti.sqrt(side * side + top * top)
-                normal = (side / d) * u + vec3(zero, sign(p[1]) * top / d, zero)
-                across = project(vec3(zero, one, zero), normal)
-                across = across / ti.max(ti.sqrt(across.dot(across)), real(1e-6))
-                result = (side / d) * turn + g.dot(across) / d * across
-            elif side > top:
-                result = turn
-        if kind == TORUS:
-            u, r = radial_unit(p)
-            q = (r - size[0]) * u + vec3(zero, p[1], zero)
-            s = length(q)
-            normal = q / s
-            around = vec3(-u[2], zero, u[0])
-            planar = g - g.dot(around) * around
-            result = project(planar, normal) / s + ((r - size[0]) / (r * s)) * g.dot(around) * around
-        return result
+            bend = project(moved, normal) / s
+        if kind == MESH:
+            normal, distance, bend, steepness = mesh_surface(values, first, size, p, g)
+        return normal, distance, bend, steepness
 
     @ti.func
     def pose_position(pose):
@@ -194,8 +222,7 @@ def build_distance(real: Any) -> SimpleNamespace:
 
     return SimpleNamespace(
         part_centre=part_centre,
-        distance_and_normal=distance_and_normal,
-        normal_adjoint=normal_adjoint,
+        surface=surface,
         pose_position=pose_position,
         pose_axis=pose_axis,
         rotate=rotate,

@@ -25,8 +25,7 @@ def build_grid(real: Any, atomic: bool) -> SimpleNamespace:
     """
     types, geometry = build_types(real), build_distance(real)
     vec3, vec3i, vec4, vec8, load_tool = types.vec3, types.vec3i, types.vec4, types.vec8, types.load_tool
-    distance_and_normal, normal_adjoint = geometry.distance_and_normal, geometry.normal_adjoint
-    part_centre = geometry.part_centre
+    surface, part_centre = geometry.surface, geometry.part_centre
     pose_position, pose_axis, rotate, rotate_adjoint = (
         geometry.pose_position,
         geometry.pose_axis,
@@ -59,11 +58,13 @@ def build_grid(real: Any, atomic: bool) -> SimpleNamespace:
         return (pose_position(after) - pose_position(before) + turn) / time_step
 
     @ti.func
-    def contact(parameters: ti.template(), tool: ti.template(), before, after, node, velocity):
+    def contact(parameters: ti.template(), values: ti.template(), tool: ti.template(), before, after, node, velocity):
         """A node's velocity after contact with one tool."""
         local = rotate(before[3], -pose_axis(before), node - pose_position(before))
         centre = part_centre(tool.kind, tool.size, before[7], local)
-        local_normal, distance = distance_and_normal(tool.kind, tool.size, local - centre)
+        local_normal, distance, _bend, _steepness = surface(
+            values, tool.grid_first, tool.kind, tool.size, local - centre, vec3(zero, zero, zero)
+        )
         k = influence(parameters, distance)
         result = velocity
         if k > zero:
@@ -89,6 +90,7 @@ def build_grid(real: Any, atomic: bool) -> SimpleNamespace:
     @ti.func
     def contact_adjoint(
         parameters: ti.template(),
+        values: ti.template(),
         tool: ti.template(),
         before,
         after,
@@ -103,7 +105,9 @@ def build_grid(real: Any, atomic: bool) -> SimpleNamespace:
         """Gradient with respect to the velocity before contact; adds those of both poses to `grad_poses`."""
         local = rotate(before[3], -pose_axis(before), node - pose_position(before))
         centre = part_centre(tool.kind, tool.size, before[7], local)
-        local_normal, distance = distance_and_normal(tool.kind, tool.size, local - centre)
+        local_normal, distance, _bend, steepness = surface(
+            values, tool.grid_first, tool.kind, tool.size, local - centre, vec3(zero, zero, zero)
+        )
         k = influence(parameters, distance)
         result = g
         if k > zero:
@@ -148,9 +152,11 @@ def build_grid(real: Any, atomic: bool) -> SimpleNamespace:
             gl = rotate(after[3], -pose_axis(after), gvc) - rotate(before[3], -pose_axis(before), gvc)
             # normal and influence
             gq_before += rotate_adjoint(before[3], pose_axis(before), local_normal, gn)
-            gs = normal_adjoint(tool.kind, tool.size, local - centre, rotate(before[3], -pose_axis(before), gn))
+            _normal, _distance, gs, _steepness = surface(
+                values, tool.grid_first, tool.kind, tool.size, local - centre, rotate(before[3], -pose_axis(before), gn)
+            )
             if parameters.softness > zero and distance > zero:
-                gs -= (gk * parameters.softness * k) * local_normal
+                gs -= (gk * parameters.softness * k * steepness) * local_normal
             gl += gs
             gap = real(zero)
             if tool.kind == CHOPSTICKS:
@@ -258,17 +264,28 @@ def build_grid(real: Any, atomic: bool) -> SimpleNamespace:
         return vec3(total[0], total[1], total[2]) / total[3] + parameters.time_step * parameters.gravity
 
     @ti.func
-    def after_contact(parameters: ti.template(), tools: ti.template(), count, poses: ti.template(), world, frame, node, velocity):
+    def after_contact(
+        parameters: ti.template(),
+        values: ti.template(),
+        tools: ti.template(),
+        count,
+        poses: ti.template(),
+        world,
+        frame,
+        node,
+        velocity,
+    ):
         """Velocity after contact with the first `count` tools."""
         v = velocity
         for m in range(count):
-            v = contact(parameters, load_tool(tools, m), poses[world, frame, m], poses[world, frame + 1, m], node, v)
+            v = contact(parameters, values, load_tool(tools, m), poses[world, frame, m], poses[world, frame + 1, m], node, v)
         return v
 
     @ti.func
     def update_node(
         total,
         parameters: ti.template(),
+        values: ti.template(),
         tools: ti.template(),
         poses: ti.template(),
         world,
@@ -282,7 +299,7 @@ def build_grid(real: Any, atomic: bool) -> SimpleNamespace:
             number = node_number(index, box)
             node = parameters.node_distance * ti.cast(number, real)
             v = free_velocity(total, parameters)
-            v = after_contact(parameters, tools, parameters.tool_count, poses, world, frame, node, v)
+            v = after_contact(parameters, values, tools, parameters.tool_count, poses, world, frame, node, v)
             v = boundary(parameters, number, v)
         return vec4(v[0], v[1], v[2], zero)
 
@@ -291,6 +308,7 @@ def build_grid(real: Any, atomic: bool) -> SimpleNamespace:
         total,
         incoming,
         parameters: ti.template(),
+        values: ti.template(),
         tools: ti.template(),
         poses: ti.template(),
         world,
@@ -310,12 +328,14 @@ def build_grid(real: Any, atomic: bool) -> SimpleNamespace:
             # from the last stage, the boundary, back to the first tool: each needs the velocity that it was given
             for r in range(parameters.tool_count + 1):
                 m = parameters.tool_count - r
-                v = after_contact(parameters, tools, m, poses, world, frame, node, start)
+                v = after_contact(parameters, values, tools, m, poses, world, frame, node, start)
                 if r == 0:
                     g = boundary_adjoint(parameters, number, v, g)
                 else:
                     before, after = poses[world, frame, m], poses[world, frame + 1, m]
-                    g = contact_adjoint(parameters, load_tool(tools, m), before, after, node, v, g, grad_poses, row, frame, m)
+                    g = contact_adjoint(
+                        parameters, values, load_tool(tools, m), before, after, node, v, g, grad_poses, row, frame, m
+                    )
             inverse = one / total[3]
             raw = inverse * vec3(total[0], total[1], total[2])
             result = vec4(inverse * g[0], inverse * g[1], inverse * g[2], -inverse * g.dot(raw))

@@ -100,7 +100,7 @@ def build_substep(real: Any, on_cuda: bool) -> SimpleNamespace:
                 n = world * box.nodes + index
                 moved = grid.sum_rows(rows, n, worlds * box.nodes, row_count)
                 total[n] = moved
-                work[velocities + n] = grid.update_node(moved, parameters, tools, poses, world, frame, box, index)
+                work[velocities + n] = grid.update_node(moved, parameters, values, tools, poses, world, frame, box, index)
             unit += lanes_of(numbers, box.nodes)
 
     @ti.kernel
@@ -205,7 +205,7 @@ def build_substep(real: Any, on_cuda: bool) -> SimpleNamespace:
                     n = world * box.nodes + index
                     incoming = grid.sum_rows(work, n, worlds * box.nodes, rows)
                     work[n] = grid.update_node_adjoint(
-                        total[n], incoming, parameters, tools, poses, world, frame, box, index, grad_poses, row
+                        total[n], incoming, parameters, values, tools, poses, world, frame, box, index, grad_poses, row
                     )
                 unit += lanes_of(numbers, box.nodes)
         ti.loop_config(block_dim=block_dim, block_dim_adaptive=False)

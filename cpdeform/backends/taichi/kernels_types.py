@@ -25,15 +25,15 @@ POSITION, VELOCITY, AFFINE, STRAIN, RECORD_SIZE = 0, 3, 6, 15, 21
     GROUND_FRICTION,
     GRAVITY,
 ) = range(8)
-LOWER, UPPER = GRAVITY + 3, GRAVITY + 6
-"""Where the array of the scene's constants holds them; see `load_parameters`."""
+LOWER, UPPER, GRIDS = GRAVITY + 3, GRAVITY + 6, GRAVITY + 9
+"""Where the array of the scene's constants holds them, see `load_parameters`, and after them the numbers of tools from meshes."""
 
 GRID_SIZE, GROUND_NODES, TOOL_COUNT, WORLDS, PARTICLES, BLOCKS, LANES, ORIGIN = range(8)
 BOX_SIZE = ORIGIN + 3
 """Where the array of whole numbers holds the scene's, those of the launch, and the box of nodes that the grid covers."""
 
 TOOL_SIZE, TOOL_FRICTION, TOOL_SCALE, TOOL_LOWER, TOOL_UPPER = 0, 4, 5, 12, 15
-TOOL_KIND, TOOL_ACTION_OFFSET, TOOL_ACTION_SIZE, TOOL_VALUES = 18, 19, 20, 21
+TOOL_KIND, TOOL_ACTION_OFFSET, TOOL_ACTION_SIZE, TOOL_GRID_FIRST, TOOL_VALUES = 18, 19, 20, 21, 22
 """Where a tool's record holds its lengths (4), friction, motions per substep (7), bounds (3 each) and whole numbers."""
 
 
@@ -118,6 +118,7 @@ def build_types(real: Any) -> SimpleNamespace:
             friction=record[TOOL_FRICTION],
             action_offset=ti.cast(record[TOOL_ACTION_OFFSET], ti.i32),
             action_size=ti.cast(record[TOOL_ACTION_SIZE], ti.i32),
+            grid_first=ti.cast(record[TOOL_GRID_FIRST], ti.i32),
             scale=vec7([record[TOOL_SCALE + a] for a in range(7)]),
             lower=vec3(record[TOOL_LOWER], record[TOOL_LOWER + 1], record[TOOL_LOWER + 2]),
             upper=vec3(record[TOOL_UPPER], record[TOOL_UPPER + 1], record[TOOL_UPPER + 2]),

@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cpdeform.backends.scene_numbers import material_numbers, scene_numbers, tool_numbers
-from cpdeform.backends.taichi.kernels_types import TOOL_VALUES
+from cpdeform.backends.scene_numbers import material_numbers, scene_numbers, tool_grids, tool_numbers
+from cpdeform.backends.taichi.kernels_types import GRIDS, TOOL_VALUES
 from cpdeform.core.scene import Scene
 
 
 def make_values(scene: Scene) -> Tensor:
-    """The constants of a scene, float64, but for the whole numbers."""
+    """The constants of a scene, float64, but for the whole numbers; after them, from `GRIDS` on, the numbers of meshes."""
     numbers = scene_numbers(scene)
     return torch.tensor(
         [
@@ -25,6 +25,7 @@ def make_values(scene: Scene) -> Tensor:
             *numbers.gravity,
             *numbers.lower,
             *numbers.upper,
+            *tool_grids(scene),
         ],
         dtype=torch.float64,
     )
@@ -39,9 +40,19 @@ def make_numbers(scene: Scene, *, worlds: int, blocks: int, lanes: int) -> Tenso
 
 
 def make_tools(scene: Scene) -> Tensor:
-    """The tools (M, 21), float64; one unused row where there is none."""
+    """The tools (M, 22), float64; one unused row where there is none."""
     rows = [
-        [*tool.size, tool.friction, *tool.scale, *tool.lower, *tool.upper, tool.kind, tool.action_offset, tool.action_size]
+        [
+            *tool.size,
+            tool.friction,
+            *tool.scale,
+            *tool.lower,
+            *tool.upper,
+            tool.kind,
+            tool.action_offset,
+            tool.action_size,
+            GRIDS + tool.grid_first,
+        ]
         for tool in tool_numbers(scene)
     ]
     return torch.tensor(rows or [[0.0] * TOOL_VALUES], dtype=torch.float64)

@@ -43,7 +43,7 @@ class Program:
         scene: The scene.
         kernels: All kernels.
         values: Constants of the scene.
-        tools: Tools (M, 21).
+        tools: Tools (M, 22).
         materials: Material (N, 3) of each particle.
         on_cuda: Whether the kernels are CUDA's.
     """

@@ -1,8 +1,9 @@
-"""Signed distances of the tools in their local frames, outward normals, and the derivative of the normals.
+"""Signed distances of the tools in their local frames, outward normals, and how these change.
 
 The entries of `Tool.size`, lengths: Sphere (radius); Capsule, RollingPin and Chopsticks (radius, height); Box (half extents,
-rounding); Cylinder (radius, half height); Torus (major radius, tube radius). Chopsticks are the capsule nearer to a point:
-`part_centre` is its centre.
+rounding); Cylinder (radius, half height); Torus (major radius, tube radius); Mesh (distance between nodes, numbers of nodes;
+its numbers are in `Parameters.grids` from `grid_first` on). Chopsticks are the capsule nearer to a point: `part_centre` is its
+centre.
 """
 
 import functools
@@ -11,10 +12,10 @@ from typing import Any
 
 import warp as wp
 
-from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, ROLLING_PIN, SPHERE, TORUS
+from cpdeform.backends.scene_numbers import BOX, CAPSULE, CHOPSTICKS, CYLINDER, MESH, ROLLING_PIN, SPHERE, TORUS
 from cpdeform.backends.warp.kernels_types import build_types
 
-TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks", "Mesh")
 """The kinds of tools that the functions below know; the simulator refuses others."""
 
 
@@ -23,7 +24,7 @@ def build_distance(real: Any) -> SimpleNamespace:
     """Warp functions of signed distances and rotations for one scalar type."""
     types = build_types(real)
     vec3, vec4, vec8 = types.vec3, types.vec4, types.vec8
-    zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
+    zero, half, three_quarters, one, two = real(0.0), real(0.5), real(0.75), real(1.0), real(2.0)
     # PlasticineLab's length: finite gradient at zero
     length_regularization = real(1e-8)
 
@@ -67,105 +68,133 @@ def build_distance(real: Any) -> SimpleNamespace:
         return result
 
     @wp.func
-    def distance_and_normal(kind: int, size: vec4, p: vec3):
-        """Signed distance and outward normal at the local point p, as (normal, distance)."""
+    def project(g: vec3, normal: vec3):
+        return g - wp.dot(g, normal) * normal
+
+    @wp.func
+    def spline(f: real):
+        """Weights of a quadratic B-spline at three nodes, `f` from the middle one, and their derivatives."""
+        weights = vec3(half * (half - f) * (half - f), three_quarters - f * f, half * (half + f) * (half + f))
+        return weights, vec3(f - half, -two * f, f + half)
+
+    @wp.func
+    def mesh_place(along: real, size: real, count: real):
+        """Where a coordinate lies in the grid: clipped, its nearest node, and how far it is beyond, in nodes."""
+        u = along / size + half * (count - one)
+        inside = wp.min(wp.max(u, one), count - two)
+        base = wp.min(int(inside + half), int(count) - 2)
+        return inside - real(base), base, u - inside
+
+    @wp.func
+    def mesh_surface(grids: wp.array(dtype=real), first: int, size: vec4, p: vec3, g: vec3):
+        """As `surface`, of a mesh: the quadratic B-spline of its distance; beyond the grid the way there is added."""
+        fx, bx, ox = mesh_place(p[0], size[0], size[1])
+        fy, by, oy = mesh_place(p[1], size[0], size[2])
+        fz, bz, oz = mesh_place(p[2], size[0], size[3])
+        wx, dx = spline(fx)
+        wy, dy = spline(fy)
+        wz, dz = spline(fz)
+        curve = vec3(one, -two, one)
+        distance = zero
+        gradient = vec3(zero, zero, zero)
+        straight = vec3(zero, zero, zero)
+        mixed = vec3(zero, zero, zero)
+        for n in range(27):
+            i = n // 9
+            j = (n // 3) % 3
+            k = n % 3
+            node = ((bx + i - 1) * int(size[2]) + by + j - 1) * int(size[3]) + bz + k - 1
+            c = grids[first + node]
+            xy, xz, yz = dx[i] * dy[j] * wz[k], dx[i] * wy[j] * dz[k], wx[i] * dy[j] * dz[k]
+            distance += c * wx[i] * wy[j] * wz[k]
+            gradient += c * vec3(dx[i] * wy[j] * wz[k], wx[i] * dy[j] * wz[k], wx[i] * wy[j] * dz[k])
+            straight += c * vec3(curve[i] * wy[j] * wz[k], wx[i] * curve[j] * wz[k], wx[i] * wy[j] * curve[k])
+            mixed += c * vec3(xy, xz, yz)
+        steep = wp.max(wp.sqrt(wp.dot(gradient, gradient)) / size[0], real(1e-3))
+        normal = gradient / (steep * size[0])
+        distance += wp.sqrt(ox * ox + oy * oy + oz * oz) * size[0]
+        # The transposed derivative of the normal: an interpolated distance's Hessian does not vanish along the normal.
+        a = project(g, normal)
+        bend = vec3(
+            straight[0] * a[0] + mixed[0] * a[1] + mixed[1] * a[2],
+            mixed[0] * a[0] + straight[1] * a[1] + mixed[2] * a[2],
+            mixed[1] * a[0] + mixed[2] * a[1] + straight[2] * a[2],
+        )
+        return normal, distance, bend / (steep * size[0] * size[0]), steep
+
+    @wp.func
+    def surface(grids: wp.array(dtype=real), first: int, kind: int, size: vec4, p: vec3, g: vec3):
+        """Normal and signed distance at the local point p, and how the normal changes along g: (normal, distance, bend, steepness).
+
+        All that kernels know of a kind. The derivative of a distance's gradient is a symmetric matrix, the distance's Hessian, so
+        that `bend` is the adjoint of the normal, too; where it is not used, the compiler leaves it out. The steepness is the
+        length of the distance's gradient, which is not 1 near the edges of a mesh's interpolated distance.
+        """
         distance = zero
         normal = vec3(zero, one, zero)
+        bend = vec3(zero, zero, zero)
+        steepness = one
         if kind == wp.static(SPHERE):
             r = length(p)
             distance = r - size[0]
             normal = p / r
+            bend = project(g, normal) / r
         if kind == wp.static(CAPSULE) or kind == wp.static(ROLLING_PIN) or kind == wp.static(CHOPSTICKS):
             h = half * size[1]
             q = vec3(p[0], p[1] - wp.min(wp.max(p[1], -h), h), p[2])
+            moved = g
+            if wp.abs(p[1]) < h:
+                moved = vec3(g[0], zero, g[2])
             r = length(q)
             distance = r - size[0]
             normal = q / r
+            bend = project(moved, normal) / r
         if kind == wp.static(BOX):
             b = vec3(size[0], size[1], size[2])
             q = wp.abs(p) - b
             axis = largest_axis(q)
             if q[axis] > zero:
                 o = box_offset(p, b)
+                moved = wp.cw_mul(g, vec3(wp.step(-q[0]), wp.step(-q[1]), wp.step(-q[2])))
                 r = wp.sqrt(wp.dot(o, o))
                 distance = r - size[3]
                 normal = o / r
+                bend = project(moved, normal) / r
             else:
                 distance = q[axis] - size[3]
                 normal = vec3(zero, zero, zero)
                 normal[axis] = sign(p[axis])
         if kind == wp.static(CYLINDER):
             u, r = radial_unit(p)
+            turn = project(vec3(g[0], zero, g[2]), u) / r
             side = r - size[0]
             top = wp.abs(p[1]) - size[1]
             up = vec3(zero, sign(p[1]), zero)
             if side > zero and top > zero:
                 distance = wp.sqrt(side * side + top * top)
                 normal = (side / distance) * u + (top / distance) * up
+                moved_side = wp.dot(g, u)
+                moved_top = wp.dot(g, up)
+                moved = moved_side * u + moved_top * up + side * turn
+                bend = (moved - (side * moved_side + top * moved_top) / distance * normal) / distance
             else:
                 distance = wp.max(side, top)
                 normal = up
                 if side > top:
                     normal = u
+                    bend = turn
         if kind == wp.static(TORUS):
             u, r = radial_unit(p)
-            q = (r - size[0]) * u + vec3(zero, p[1], zero)
+            side = r - size[0]
+            q = side * u + vec3(zero, p[1], zero)
+            moved = wp.dot(g, u) * u + side / r * project(vec3(g[0], zero, g[2]), u) + vec3(zero, g[1], zero)
             s = length(q)
             distance = s - size[1]
             normal = q / s
-        return normal, distance
-
-    @wp.func
-    def project(g: vec3, normal: vec3):
-        return g - wp.dot(g, normal) * normal
-
-    @wp.func
-    def normal_adjoint(kind: int, size: vec4, p: vec3, g: vec3):
-        """(d normal / d p)^T g; the derivative is a symmetric matrix, the distance's Hessian."""
-        result = vec3(zero, zero, zero)
-        if kind == wp.static(SPHERE):
-            r = length(p)
-            result = project(g, p / r) / r
-        if kind == wp.static(CAPSULE) or kind == wp.static(ROLLING_PIN) or kind == wp.static(CHOPSTICKS):
-            h = half * size[1]
-            q = vec3(p[0], p[1] - wp.min(wp.max(p[1], -h), h), p[2])
-            r = length(q)
-            result = project(g, q / r) / r
-            if wp.abs(p[1]) < h:
-                result[1] = zero
-        if kind == wp.static(BOX):
-            b = vec3(size[0], size[1], size[2])
-            q = wp.abs(p) - b
-            if wp.max(q[0], wp.max(q[1], q[2])) > zero:
-                o = box_offset(p, b)
-                r = wp.sqrt(wp.dot(o, o))
-                result = project(g, o / r) / r
-                for axis in range(3):
-                    if q[axis] <= zero:
-                        result[axis] = zero
-        if kind == wp.static(CYLINDER):
-            u, r = radial_unit(p)
-            side = r - size[0]
-            top = wp.abs(p[1]) - size[1]
-            around = vec3(-u[2], zero, u[0])
-            turn = wp.dot(g, around) / r * around
-            if side > zero and top > zero:
-                d = wp.sqrt(side * side + top * top)
-                normal = (side / d) * u + vec3(zero, sign(p[1]) * top / d, zero)
-                across = project(vec3(zero, one, zero), normal)
-                across = across / wp.max(wp.sqrt(wp.dot(across, across)), real(1e-6))
-                result = (side / d) * turn + wp.dot(g, across) / d * across
-            elif side > top:
-                result = turn
-        if kind == wp.static(TORUS):
-            u, r = radial_unit(p)
-            q = (r - size[0]) * u + vec3(zero, p[1], zero)
-            s = length(q)
-            normal = q / s
-            around = vec3(-u[2], zero, u[0])
-            planar = g - wp.dot(g, around) * around
-            result = project(planar, normal) / s + ((r - size[0]) / (r * s)) * wp.dot(g, around) * around
-        return result
+            bend = project(moved, normal) / s
+        if kind == wp.static(MESH):
+            normal, distance, bend, steepness = mesh_surface(grids, first, size, p, g)
+        return normal, distance, bend, steepness
 
     @wp.func
     def pose_position(pose: vec8):
@@ -192,8 +221,7 @@ def build_distance(real: Any) -> SimpleNamespace:
 
     return SimpleNamespace(
         part_centre=part_centre,
-        distance_and_normal=distance_and_normal,
-        normal_adjoint=normal_adjoint,
+        surface=surface,
         pose_position=pose_position,
         pose_axis=pose_axis,
         rotate=rotate,

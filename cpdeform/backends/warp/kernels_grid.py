@@ -21,8 +21,7 @@ def build_grid(real: Any) -> SimpleNamespace:
     """Warp kernels of the grid update for one scalar type."""
     types, geometry = build_types(real), build_distance(real)
     vec3, vec4, vec8, Parameters, Tool = types.vec3, types.vec4, types.vec8, types.Parameters, types.Tool
-    distance_and_normal, normal_adjoint = geometry.distance_and_normal, geometry.normal_adjoint
-    part_centre = geometry.part_centre
+    surface, part_centre = geometry.surface, geometry.part_centre
     pose_position, pose_axis, rotate, rotate_adjoint = (
         geometry.pose_position,
         geometry.pose_axis,
@@ -59,7 +58,9 @@ def build_grid(real: Any) -> SimpleNamespace:
         """A node's velocity after contact with one tool."""
         local = rotate(before[3], -pose_axis(before), node - pose_position(before))
         centre = part_centre(tool.kind, tool.size, before[7], local)
-        local_normal, distance = distance_and_normal(tool.kind, tool.size, local - centre)
+        local_normal, distance, _bend, _steepness = surface(
+            parameters.grids, tool.grid_first, tool.kind, tool.size, local - centre, vec3(zero, zero, zero)
+        )
         k = influence(parameters, distance)
         result = velocity
         if k > zero:
@@ -92,7 +93,9 @@ def build_grid(real: Any) -> SimpleNamespace:
         """Gradient with respect to the velocity before contact; adds those of both poses to `grad_pose`."""
         local = rotate(before[3], -pose_axis(before), node - pose_position(before))
         centre = part_centre(tool.kind, tool.size, before[7], local)
-        local_normal, distance = distance_and_normal(tool.kind, tool.size, local - centre)
+        local_normal, distance, _bend, steepness = surface(
+            parameters.grids, tool.grid_first, tool.kind, tool.size, local - centre, vec3(zero, zero, zero)
+        )
         k = influence(parameters, distance)
         result = g
         if k > zero:
@@ -137,9 +140,11 @@ def build_grid(real: Any) -> SimpleNamespace:
             gl = rotate(after[3], -pose_axis(after), gvc) - rotate(before[3], -pose_axis(before), gvc)
             # normal and influence
             gq_before += rotate_adjoint(before[3], pose_axis(before), local_normal, gn)
-            gs = normal_adjoint(tool.kind, tool.size, local - centre, rotate(before[3], -pose_axis(before), gn))
+            _normal, _distance, gs, _steepness = surface(
+                parameters.grids, tool.grid_first, tool.kind, tool.size, local - centre, rotate(before[3], -pose_axis(before), gn)
+            )
             if parameters.softness > zero and distance > zero:
-                gs -= (gk * parameters.softness * k) * local_normal
+                gs -= (gk * parameters.softness * k * steepness) * local_normal
             gl += gs
             gap = zero
             if tool.kind == wp.static(CHOPSTICKS):

@@ -51,6 +51,7 @@ def build_types(real: Any) -> SimpleNamespace:
         upper: vec3
         grid_size: int
         tool_count: int
+        grids: wp.array(dtype=real)  # numbers of all tools made from meshes
 
     @wp.struct
     class Tool:
@@ -62,6 +63,7 @@ def build_types(real: Any) -> SimpleNamespace:
         scale: vec7  # motion per substep at action 1: length, radians
         lower: vec3
         upper: vec3
+        grid_first: int  # where its numbers begin in `grids`
 
     return SimpleNamespace(
         real=real, vec3=vec3, vec4=vec4, vec6=vec6, vec7=vec7, vec8=vec8, mat33=mat33, Parameters=Parameters, Tool=Tool

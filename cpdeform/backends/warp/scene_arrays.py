@@ -7,17 +7,18 @@ from typing import Any
 
 import warp as wp
 
-from cpdeform.backends.scene_numbers import material_numbers, scene_numbers, tool_numbers
+from cpdeform.backends.scene_numbers import material_numbers, scene_numbers, tool_grids, tool_numbers
 from cpdeform.backends.warp.kernels_types import build_types
 from cpdeform.core.scene import Scene
 
 
-def make_parameters(scene: Scene, real: Any) -> Any:
+def make_parameters(scene: Scene, real: Any, device: str) -> Any:
     """The constants of a scene as the struct `Parameters`."""
     types = build_types(real)
     parameters = types.Parameters()
     for name, value in dataclasses.asdict(scene_numbers(scene)).items():
         setattr(parameters, name, types.vec3(*value) if isinstance(value, tuple) else value)
+    parameters.grids = wp.array(tool_grids(scene), dtype=real, device=device)
     return parameters
 
 

@@ -125,7 +125,7 @@ class SimulatorWarp(SimulatorCheckpointing):
         return Program(
             types=self._types,
             kernels=kernels,
-            parameters=make_parameters(self.scene, self._real),
+            parameters=make_parameters(self.scene, self._real, device),
             tools=make_tools(self.scene, self._real, device),
             constants=make_constants(self.scene, self._real, device),
             substeps=self.scene.substeps,

@@ -26,6 +26,10 @@ class Shape(abc.ABC):
     def distance(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         """Signed distance (...) of the points with the coordinates x, y, z (...) to the surface, negative inside, length units."""
 
+    def quick_distance(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """As `distance`, for searches over very many points that need no gradient; a little less exact where that is quicker."""
+        return self.distance(x, y, z)
+
     @abc.abstractmethod
     def half_extents(self, axes: Tensor) -> Tensor:
         """Half edges of the smallest box around the solid that is centred on the local origin.

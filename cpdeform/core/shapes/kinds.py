@@ -12,15 +12,16 @@ from cpdeform.core.shapes.body import BodyBase
 from cpdeform.core.shapes.box import BodyBox, ToolBox
 from cpdeform.core.shapes.chopsticks import ToolChopsticks
 from cpdeform.core.shapes.cylinder import ToolCylinder
+from cpdeform.core.shapes.mesh import BodyMesh, ToolMesh
 from cpdeform.core.shapes.rod import ToolCapsule, ToolRollingPin
 from cpdeform.core.shapes.sphere import BodySphere, ToolSphere
 from cpdeform.core.shapes.tool import ToolBase
 from cpdeform.core.shapes.torus import ToolTorus
 
-Body = Annotated[BodyBox | BodySphere, Field(discriminator="kind")]
+Body = Annotated[BodyBox | BodySphere | BodyMesh, Field(discriminator="kind")]
 
 Tool = Annotated[
-    ToolSphere | ToolCapsule | ToolBox | ToolCylinder | ToolTorus | ToolRollingPin | ToolChopsticks,
+    ToolSphere | ToolCapsule | ToolBox | ToolCylinder | ToolTorus | ToolRollingPin | ToolChopsticks | ToolMesh,
     Field(discriminator="kind"),
 ]
 """Kernels know a kind by its place in this list, those in C++ too: new kinds go to the end."""

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from cpdeform.core.bounded import Real
 from cpdeform.core.errors import InputError
 from cpdeform.core.model import FrozenModel, NonNegativeFloat, Quaternion, Vector3
-from cpdeform.core.shapes.base import Shape
+from cpdeform.core.shapes.base import Array, Shape
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -65,6 +65,11 @@ class ToolBase(FrozenModel, abc.ABC):
     @abc.abstractmethod
     def kernel_lengths(self) -> tuple[float, ...]:
         """The lengths that simulators' kernels compute the shape from, at most four."""
+
+    @property
+    def kernel_grid(self) -> Array | None:
+        """Numbers (X, Y, Z) on a grid that simulators' kernels compute the shape from, too; None for shapes of few lengths."""
+        return None
 
     @property
     def start_gap(self) -> float:

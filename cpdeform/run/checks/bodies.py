@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 
-from cpdeform.core.scene import Body, BodyBox, Scene
+from cpdeform.core.scene import Body, BodySphere, Scene
 from cpdeform.run.checks.finding import Finding
 
 KIND = "near bodies"
@@ -48,9 +48,9 @@ def gap(first: Body, second: Body) -> float:
 
 
 def _core(body: Body) -> tuple[float, float, float]:
-    """Half extents of a box, or of the point that a ball is grown from, length units."""
-    return body.half_extents if isinstance(body, BodyBox) else (0.0, 0.0, 0.0)
+    """Half extents of a box (of that around a mesh), or of the point that a ball is grown from, length units."""
+    return (0.0, 0.0, 0.0) if isinstance(body, BodySphere) else body.half_extents
 
 
 def _rounding(body: Body) -> float:
-    return 0.0 if isinstance(body, BodyBox) else body.radius
+    return body.radius if isinstance(body, BodySphere) else 0.0

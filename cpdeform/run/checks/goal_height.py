@@ -18,11 +18,6 @@ LEAST_PART = 0.02
 """Part of the goal's particles that is worth telling of."""
 
 
-def floor_height(scene: Scene) -> float:
-    """Height that clay comes to rest at, length units: the top of the floor's boundary layer, whose nodes let nothing sink."""
-    return (WALL_NODES + int(scene.ground_height / scene.node_distance)) * scene.node_distance
-
-
 def check_goal_floating(scene: Scene, goal: NDArray[np.float64]) -> list[Finding]:
     """Tell of parts of the goal (M, 3), length units, that nothing carries: neither the floor nor a fixed tool.
 
@@ -35,7 +30,7 @@ def check_goal_floating(scene: Scene, goal: NDArray[np.float64]) -> list[Finding
     free = FLOATING_CELLS * scene.node_distance
     for part in range(int(labels.max()) + 1):
         particles = goal[labels == part]
-        height = float(particles[:, 1].min()) - floor_height(scene)
+        height = float(particles[:, 1].min()) - scene.resting_height
         if len(particles) >= LEAST_PART * len(goal) and height > free and not _near_fixed_tool(scene, particles, free):
             heights.append(height)
             share += len(particles) / len(goal)
@@ -48,7 +43,7 @@ def check_goal_floating(scene: Scene, goal: NDArray[np.float64]) -> list[Finding
             "note" if held else "warning",
             "goal floating",
             "goal",
-            f"{share:.0%} of the goal hangs {span} above where clay rests, {floor_height(scene):.3g}, and "
+            f"{share:.0%} of the goal hangs {span} above where clay rests, {scene.resting_height:.3g}, and "
             + ("only tools can hold it there." if held else "no tools can hold it there."),
             "Lower the goal by that much, or raise the floor (ground_height)"
             + ("; keep it if the tools are to lift the clay." if held else "."),
@@ -61,7 +56,7 @@ def check_goal_below_floor(scene: Scene, clay: NDArray[np.float64], goal: NDArra
 
     The floor's boundary layer is a few nodes thick. Clay that starts inside it stays as low as it is; other clay rests on top.
     """
-    lowest = min(floor_height(scene), float(clay[:, 1].min())) - 0.25 * scene.node_distance
+    lowest = min(scene.resting_height, float(clay[:, 1].min())) - 0.25 * scene.node_distance
     share = float((goal[:, 1] < lowest).mean())
     if share < LEAST_PART:
         return []
@@ -71,7 +66,7 @@ def check_goal_below_floor(scene: Scene, clay: NDArray[np.float64], goal: NDArra
             "goal below the floor",
             "goal",
             f"{share:.0%} of the goal's particles lie lower than clay can get: it comes to rest at a height of "
-            f"{floor_height(scene):.3g}, {WALL_NODES} grid nodes above ground_height, and none starts lower than "
+            f"{scene.resting_height:.3g}, {WALL_NODES} grid nodes above ground_height, and none starts lower than "
             f"{float(clay[:, 1].min()):.3g}.",
             f"Raise the goal by {max(0.0, lowest + 0.25 * scene.node_distance - float(goal[:, 1].min())):.3g}, "
             "or start the bodies as low.",

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.goal import write_goal
+from cpdeform.core.meshes.filling import fill_evenly
 from cpdeform.core.plugins import AUTO, Registry, load_registry
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import Simulator
@@ -26,7 +27,6 @@ from cpdeform.tasks.generate.motions import dent_motion, pen_motion, script_moti
 from cpdeform.tasks.generate.random_solids import random_solid
 from cpdeform.tasks.scripts import Leg, perform_state
 from cpdeform.tasks.single_stage import SCRIPTS
-from cpdeform.tasks.solids import fill_evenly
 
 FIRST_REPORTING_SEED = 1000
 """Seeds from here on are for reporting only."""

@@ -35,6 +35,7 @@ class Scene:
         scale: Sequence[float],
         lower: Sequence[float],
         upper: Sequence[float],
+        grid: NDArray[Any] | None = None,
     ) -> None: ...
 
 class CheckpointsFloat:

@@ -23,7 +23,7 @@ except ImportError as error:
         "simulator", "native", module="cpdeform_native._simulator", install="pip install cpdeform-native"
     ) from error
 
-TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks")
+TOOL_KINDS = ("Sphere", "Capsule", "Box", "Cylinder", "Torus", "RollingPin", "Chopsticks", "Mesh")
 """The kinds of tools that the C++ knows."""
 
 
@@ -196,7 +196,8 @@ def _native_scene(scene: Scene) -> Any:
         substeps=scene.substeps,
         particle_count=scene.particle_count,
     )
-    for tool in tool_numbers(scene):
+    for tool, shape in zip(tool_numbers(scene), scene.tools, strict=True):
+        grid = shape.kernel_grid
         native.add_tool(
             kind=tool.kind,
             size=tool.size,
@@ -205,5 +206,6 @@ def _native_scene(scene: Scene) -> Any:
             scale=tool.scale,
             lower=tool.lower,
             upper=tool.upper,
+            grid=None if grid is None else np.ascontiguousarray(grid, dtype=np.float64),
         )
     return native

@@ -24,7 +24,7 @@ class SimulatorToy(Simulator):
         differentiable=True,
         devices=("cpu",),
         dtypes=(torch.float64, torch.float32),
-        tool_kinds=("Sphere", "Capsule", "Box", "Cylinder", "Torus"),
+        tool_kinds=("Sphere", "Capsule", "Box", "Cylinder", "Torus", "Mesh"),
         deterministic_devices=("cpu",),
     )
 

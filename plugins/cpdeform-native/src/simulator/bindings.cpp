@@ -6,6 +6,7 @@
 #include <nanobind/stl/unique_ptr.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <memory>
 #include <optional>
 #include <stdexcept>
@@ -48,11 +49,25 @@ Engine<Real>* make_engine(InstructionSet set, const Scene& scene, const double* 
   return choose(engines_baseline::make_engine_float, engines_baseline::make_engine_double);
 }
 
+int64_t grid_size_of(const Tool& tool) { return int64_t(tool.size[1]) * int64_t(tool.size[2]) * int64_t(tool.size[3]); }
+
 // Everything that a history needs to stay alive.
 template <class Real>
 struct Shared {
   Shared(const Scene& s, const double* material, int threads, InstructionSet set)
-      : scene(s), team(threads, signal_came), engine(make_engine<Real>(set, s, material, threads)) {}
+      : scene(with_own_grids(s)), team(threads, signal_came), engine(make_engine<Real>(set, scene, material, threads)) {}
+
+  Scene with_own_grids(Scene s) {
+    for (int m = 0; m < s.tool_count; ++m) {
+      Tool& tool = s.tools[m];
+      if (!tool.grid) continue;
+      grids[m].assign(tool.grid, tool.grid + grid_size_of(tool));
+      tool.grid = grids[m].data();
+    }
+    return s;
+  }
+
+  std::vector<double> grids[max_tools];  // before the scene, which points to them
   Scene scene;
   Team team;
   std::unique_ptr<Engine<Real>> engine;
@@ -66,6 +81,7 @@ struct Checkpoints {
 };
 
 // Their products with the counts of a scene stay within 64 bits.
+constexpr int64_t most_grid_nodes = 1024;
 constexpr int64_t most_worlds = int64_t(1) << 20, most_steps = int64_t(1) << 28;
 
 template <class Real>
@@ -205,10 +221,17 @@ void copy(const std::vector<double>& from, double* to, size_t size, const char* 
 }
 
 void add_tool(Scene& scene, int kind, const std::vector<double>& size, double friction, int action_size,
-              const std::vector<double>& scale, const std::vector<double>& lower, const std::vector<double>& upper) {
+              const std::vector<double>& scale, const std::vector<double>& lower, const std::vector<double>& upper,
+              std::optional<In<double>> grid) {
   if (scene.tool_count == max_tools) throw std::invalid_argument("scene: too many tools");
   check_tool(kind, size, friction, action_size, scale, lower, upper);
+  if (kind == mesh) {
+    for (int a = 1; a < 4; ++a) expect_between("size", int64_t(std::min(size[a], 1e6)), 3, most_grid_nodes);
+    if (!grid) throw std::invalid_argument("grid: got nothing, expected the distances of a mesh");
+    expect_shape("grid", *grid, {int64_t(size[1]), int64_t(size[2]), int64_t(size[3])});
+  }
   Tool& tool = scene.tools[scene.tool_count++];
+  tool.grid = kind == mesh ? grid->data() : nullptr;
   tool.kind = kind;
   tool.friction = friction;
   tool.action_offset = scene.action_size;
@@ -268,7 +291,8 @@ NB_MODULE(_simulator, m) {
           },
           nb::kw_only(), "time_step"_a, "node_distance"_a, "particle_mass"_a, "gravity"_a, "softness"_a, "ground_friction"_a,
           "ground_nodes"_a, "wall_nodes"_a, "lower"_a, "upper"_a, "grid_size"_a, "substeps"_a, "particle_count"_a)
-      .def("add_tool", &add_tool, nb::kw_only(), "kind"_a, "size"_a, "friction"_a, "action_size"_a, "scale"_a, "lower"_a, "upper"_a);
+      .def("add_tool", &add_tool, nb::kw_only(), "kind"_a, "size"_a, "friction"_a, "action_size"_a, "scale"_a, "lower"_a, "upper"_a,
+           "grid"_a.noconvert().none() = nb::none(), nb::keep_alive<1, 9>());
   bind<float>(m, "SimulatorFloat", "CheckpointsFloat");
   bind<double>(m, "SimulatorDouble", "CheckpointsDouble");
 }

@@ -40,6 +40,8 @@ size_t lengths_of(int kind) {
       return 2;
     case box:
       return 3;
+    case mesh:
+      return 4;
   }
   throw_unknown_tool(kind);
 }

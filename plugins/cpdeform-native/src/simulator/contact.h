@@ -28,6 +28,7 @@ template <class Real>
 struct ToolMotion {
   int kind;
   Real size[4];
+  const double* grid;
   Real friction, gap;
   Vector<Real> position;   // before
   Vector<Real> velocity;   // of the position
@@ -39,6 +40,7 @@ struct ToolMotion {
     ToolMotion t;
     t.kind = tool.kind;
     for (int i = 0; i < 4; ++i) t.size[i] = Real(tool.size[i]);
+    t.grid = tool.grid;
     t.friction = Real(tool.friction);
     t.gap = Real(before[7]);
     t.position = {Real(before[0]), Real(before[1]), Real(before[2])};
@@ -107,7 +109,7 @@ struct Contact {
   static P apply(const Motion& tool, Real softness, const P& node, const P& velocity) {
     const P local = tool.rotation.transposed(node - tool.position);
     const P centre = G::part_centre(tool.kind, tool.size, tool.gap, local);
-    const typename G::Surface s = G::surface(tool.kind, tool.size, local - centre);
+    const typename G::Surface s = G::surface(tool.kind, tool.size, tool.grid, local - centre);
     const Real k = influence(softness, s.distance);
     if (!(k > 0)) return velocity;
     const P normal = tool.rotation * s.normal;
@@ -141,7 +143,7 @@ struct Contact {
     const P offset = node - tool.position;
     const P local = tool.rotation.transposed(offset);
     const P centre = G::part_centre(tool.kind, tool.size, tool.gap, local);
-    const typename G::Surface s = G::surface(tool.kind, tool.size, local - centre);
+    const typename G::Surface s = G::surface(tool.kind, tool.size, tool.grid, local - centre);
     const Real k = influence(softness, s.distance);
     if (!(k > 0)) return g;
     const P normal = tool.rotation * s.normal;
@@ -183,8 +185,8 @@ struct Contact {
     P gl = tool.spin.transposed(gvc);
     // normal and influence
     add_outer(gradient.rotation_before, gn, s.normal);
-    P gs = G::normal_adjoint(tool.kind, tool.size, local - centre, tool.rotation.transposed(gn));
-    if (softness > 0 && s.distance > 0) gs -= s.normal * (gk * softness * k);
+    P gs = G::surface(tool.kind, tool.size, tool.grid, local - centre, tool.rotation.transposed(gn)).bend;
+    if (softness > 0 && s.distance > 0) gs -= s.normal * (gk * softness * k * s.steepness);
     gl += gs;
     if (tool.kind == cpdeform::chopsticks) gradient.gap += Real(0.5) * (local.x >= 0 ? -gs.x : gs.x);
     // local = R^T (node - position)

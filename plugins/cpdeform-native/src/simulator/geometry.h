@@ -1,5 +1,5 @@
-// Signed distances of the tools in their local frames, outward normals, and the derivative of the normals. One point at a time: only
-// nodes near a tool come here.
+// Signed distances of the tools in their local frames, outward normals, and how these change. One point at a time: only nodes near a
+// tool come here.
 #pragma once
 
 #include <cmath>
@@ -56,16 +56,24 @@ struct Geometry {
     return {Real(0.5) * gap * sign(p.x), Real(-0.5) * size[1], 0};
   }
 
+  // The derivative of a distance's gradient is a symmetric matrix, the distance's Hessian: `bend` is its product with a direction, so
+  // that the adjoint of the normal needs no function of its own. Where it is not used, the compiler leaves it out.
   struct Surface {
     P normal;
     Real distance;
+    P bend;
+    Real steepness = 1;  // length of the distance's gradient, which a mesh's interpolated one has near edges
   };
 
-  static Surface surface(int kind, const Real* size, const P& p) {
+  CPDEFORM_INLINE static P across(const P& g, const P& normal) { return g - normal * dot(g, normal); }
+
+  // Outward normal and signed distance at a local point p, and how the normal changes along g. All that kernels know of a kind.
+  CPDEFORM_INLINE static Surface surface(int kind, const Real* size, const double* grid, const P& p, const P& g = {}) {
     switch (kind) {
       case cpdeform::sphere: {
         const Real r = length(p);
-        return {p * (1 / r), r - size[0]};
+        const P normal = p * (1 / r);
+        return {normal, r - size[0], across(g, normal) * (1 / r)};
       }
       case cpdeform::box: {
         const Real q[3] = {std::abs(p.x) - size[0], std::abs(p.y) - size[1], std::abs(p.z) - size[2]};
@@ -73,99 +81,98 @@ struct Geometry {
         if (q[2] > q[axis]) axis = 2;
         if (q[axis] > 0) {
           const P o = p - P{clamp(p.x, -size[0], size[0]), clamp(p.y, -size[1], size[1]), clamp(p.z, -size[2], size[2])};
+          const P moved = {q[0] > 0 ? g.x : 0, q[1] > 0 ? g.y : 0, q[2] > 0 ? g.z : 0};
           const Real r = std::sqrt(dot(o, o));
-          return {o * (1 / r), r - size[3]};
+          const P normal = o * (1 / r);
+          return {normal, r - size[3], across(moved, normal) * (1 / r)};
         }
         P normal;
         (axis == 0 ? normal.x : axis == 1 ? normal.y : normal.z) = sign(axis == 0 ? p.x : axis == 1 ? p.y : p.z);
-        return {normal, q[axis] - size[3]};
+        return {normal, q[axis] - size[3], {}};
       }
       case cpdeform::cylinder: {
         const Real r = std::sqrt(p.x * p.x + p.z * p.z + length_regularization);
         const P out = {p.x / r, 0, p.z / r}, up = {0, sign(p.y), 0};
+        const P turn = across(P{g.x, 0, g.z}, out) * (1 / r);
         const Real side = r - size[0], top = std::abs(p.y) - size[1];
         if (side > 0 && top > 0) {
           const Real distance = std::sqrt(side * side + top * top);
-          return {out * (side / distance) + up * (top / distance), distance};
+          const P normal = out * (side / distance) + up * (top / distance);
+          const Real moved_side = dot(g, out), moved_top = dot(g, up);
+          const P moved = out * moved_side + up * moved_top + turn * side;
+          return {normal, distance, (moved - normal * ((side * moved_side + top * moved_top) / distance)) * (1 / distance)};
         }
-        return side > top ? Surface{out, side} : Surface{up, top};
+        return side > top ? Surface{out, side, turn} : Surface{up, top, {}};
       }
       case cpdeform::torus: {
         const Real r = std::sqrt(p.x * p.x + p.z * p.z + length_regularization);
-        const Real scale = (r - size[0]) / r;
-        const P q = {scale * p.x, p.y, scale * p.z};
+        const P out = {p.x / r, 0, p.z / r};
+        const Real side = r - size[0];
+        const P q = {side * out.x, p.y, side * out.z};
+        const P moved = out * dot(g, out) + across(P{g.x, 0, g.z}, out) * (side / r) + P{0, g.y, 0};
         const Real s = length(q);
-        return {q * (1 / s), s - size[1]};
+        const P normal = q * (1 / s);
+        return {normal, s - size[1], across(moved, normal) * (1 / s)};
       }
       case cpdeform::capsule:
       case cpdeform::rolling_pin:
       case cpdeform::chopsticks: {
         const Real h = Real(0.5) * size[1];
         const P q = {p.x, p.y - clamp(p.y, -h, h), p.z};
+        const P moved = {g.x, std::abs(p.y) < h ? 0 : g.y, g.z};
         const Real r = length(q);
-        return {q * (1 / r), r - size[0]};
+        const P normal = q * (1 / r);
+        return {normal, r - size[0], across(moved, normal) * (1 / r)};
       }
+      case cpdeform::mesh:
+        return mesh_surface(size, grid, p, g);
     }
     cpdeform::throw_unknown_tool(kind);
   }
 
-  CPDEFORM_INLINE static P across(const P& g, const P& normal) { return g - normal * dot(g, normal); }
-
-  // (d normal / d p)^T g; the derivative is symmetric, the distance's Hessian.
-  static P normal_adjoint(int kind, const Real* size, const P& p, const P& g) {
-    switch (kind) {
-      case cpdeform::sphere: {
-        const Real r = length(p);
-        return across(g, p * (1 / r)) * (1 / r);
-      }
-      case cpdeform::box: {
-        const Real q[3] = {std::abs(p.x) - size[0], std::abs(p.y) - size[1], std::abs(p.z) - size[2]};
-        if (!(q[0] > 0 || q[1] > 0 || q[2] > 0)) return {};
-        const P o = p - P{clamp(p.x, -size[0], size[0]), clamp(p.y, -size[1], size[1]), clamp(p.z, -size[2], size[2])};
-        const Real r = std::sqrt(dot(o, o));
-        P result = across(g, o * (1 / r)) * (1 / r);
-        if (q[0] <= 0) result.x = 0;
-        if (q[1] <= 0) result.y = 0;
-        if (q[2] <= 0) result.z = 0;
-        return result;
-      }
-      case cpdeform::cylinder: {
-        const Real r = std::sqrt(p.x * p.x + p.z * p.z + length_regularization);
-        const P out = {p.x / r, 0, p.z / r};
-        const Real side = r - size[0], top = std::abs(p.y) - size[1];
-        const P around = {-out.z, 0, out.x};
-        const P turn = around * (dot(g, around) / r);
-        if (side > 0 && top > 0) {
-          const Real d = std::sqrt(side * side + top * top);
-          const P normal = out * (side / d) + P{0, sign(p.y) * top / d, 0};
-          const P along = across(P{0, 1, 0}, normal);
-          const Real size_along = std::sqrt(dot(along, along));
-          const P unit = along * (1 / (size_along > Real(1e-6) ? size_along : Real(1e-6)));
-          return turn * (side / d) + unit * (dot(g, unit) / d);
-        }
-        return side > top ? turn : P{};
-      }
-      case cpdeform::torus: {
-        const Real r = std::sqrt(p.x * p.x + p.z * p.z + length_regularization);
-        const P out = {p.x / r, 0, p.z / r};
-        const P q = out * (r - size[0]) + P{0, p.y, 0};
-        const Real s = length(q);
-        const P around = {-out.z, 0, out.x};
-        const Real turning = dot(g, around);
-        return across(g - around * turning, q * (1 / s)) * (1 / s) + around * (turning * (r - size[0]) / (r * s));
-      }
-      case cpdeform::capsule:
-      case cpdeform::rolling_pin:
-      case cpdeform::chopsticks: {
-        const Real h = Real(0.5) * size[1];
-        const P q = {p.x, p.y - clamp(p.y, -h, h), p.z};
-        const Real r = length(q);
-        P result = across(g, q * (1 / r)) * (1 / r);
-        if (std::abs(p.y) < h) result.y = 0;
-        return result;
-      }
+  // The quadratic B-spline of a mesh's signed distance, its normalised gradient, and the change of that along g. Beyond the grid, the
+  // distance at its nearest point and the way there.
+  static Surface mesh_surface(const Real* size, const double* grid, const P& p, const P& g) {
+    const Real at[3] = {p.x, p.y, p.z};
+    Real weight[3][3], slope[3][3], beyond = 0;
+    int count[3], base[3];
+    for (int a = 0; a < 3; ++a) {
+      count[a] = int(size[1 + a]);
+      const Real u = at[a] / size[0] + Real(0.5) * Real(count[a] - 1);
+      // not a number goes to the first node
+      const Real inside = u > 1 ? (u < Real(count[a] - 2) ? u : Real(count[a] - 2)) : Real(1);
+      beyond += (u - inside) * (u - inside);
+      base[a] = int(inside + Real(0.5));
+      if (base[a] > count[a] - 2) base[a] = count[a] - 2;
+      const Real f = inside - Real(base[a]), low = Real(0.5) - f, high = Real(0.5) + f;
+      weight[a][0] = Real(0.5) * low * low;
+      weight[a][1] = Real(0.75) - f * f;
+      weight[a][2] = Real(0.5) * high * high;
+      slope[a][0] = -low;
+      slope[a][1] = -2 * f;
+      slope[a][2] = high;
     }
-    cpdeform::throw_unknown_tool(kind);
+    const Real curve[3] = {1, -2, 1};
+    Real distance = 0;
+    P gradient, straight, mixed;
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j)
+        for (int k = 0; k < 3; ++k) {
+          const int64_t node = (int64_t(base[0] + i - 1) * count[1] + base[1] + j - 1) * count[2] + base[2] + k - 1;
+          const Real c = Real(grid[node]);
+          const Real x = weight[0][i], y = weight[1][j], z = weight[2][k], dx = slope[0][i], dy = slope[1][j], dz = slope[2][k];
+          distance += c * x * y * z;
+          gradient += P{dx * y * z, x * dy * z, x * y * dz} * c;
+          straight += P{curve[i] * y * z, x * curve[j] * z, x * y * curve[k]} * c;
+          mixed += P{dx * dy * z, dx * y * dz, x * dy * dz} * c;
+        }
+    const Real steep = std::sqrt(dot(gradient, gradient)) / size[0], scale = steep > Real(1e-3) ? 1 / steep : Real(1e3);
+    const P normal = gradient * (scale / size[0]);
+    // The transposed derivative of the normal: an interpolated distance's Hessian does not vanish along the normal.
+    const P a = across(g, normal);
+    const P bend = {straight.x * a.x + mixed.x * a.y + mixed.y * a.z, mixed.x * a.x + straight.y * a.y + mixed.z * a.z,
+                    mixed.y * a.x + mixed.z * a.y + straight.z * a.z};
+    return {normal, distance + std::sqrt(beyond) * size[0], bend * (scale / (size[0] * size[0])), steep};
   }
 
   // Half extents of a box around a tool in its local frame, and that box's centre.
@@ -196,6 +203,9 @@ struct Geometry {
       case cpdeform::rolling_pin:
         half[0] = half[2] = size[0];
         half[1] = Real(0.5) * size[1] + size[0];
+        return;
+      case cpdeform::mesh:
+        for (int a = 0; a < 3; ++a) half[a] = Real(0.5) * size[0] * (size[1 + a] - 1);
         return;
     }
     cpdeform::throw_unknown_tool(kind);

@@ -5,12 +5,13 @@
 
 namespace cpdeform {
 
-enum ToolKind : int { sphere, capsule, box, cylinder, torus, rolling_pin, chopsticks, tool_kind_count };
+enum ToolKind : int { sphere, capsule, box, cylinder, torus, rolling_pin, chopsticks, mesh, tool_kind_count };
 
 struct Tool {
   int kind;
   double size[4];  // Sphere: radius. Capsule, RollingPin, Chopsticks: radius, height. Box: half extents, rounding. Cylinder: radius,
-                   // half height. Torus: major radius, tube radius.
+                   // half height. Torus: major radius, tube radius. Mesh: distance between nodes, numbers of nodes.
+  const double* grid;  // Mesh: coefficients of the quadratic B-spline of the distances, C order; not owned
   double friction;
   int action_offset;
   int action_size;

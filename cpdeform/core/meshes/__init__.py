@@ -1,0 +1,1 @@
+"""Triangle meshes: reading and repair, what is inside of them, signed-distance grids, particles that fill them evenly."""
