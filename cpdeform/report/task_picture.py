@@ -16,6 +16,7 @@ from cpdeform.core.task import Task
 from cpdeform.report.pictures import View, clay_colours, draw_scene
 from cpdeform.report.render import fit_camera
 from cpdeform.report.shapes import tool_surface
+from cpdeform.report.surface import particle_spacing
 
 Array = NDArray[np.float64]
 
@@ -23,8 +24,6 @@ DIRECTIONS = ((28.0, 32.0), (28.0, 78.0))
 """Azimuth and elevation of the two rows, degrees."""
 
 ASPECT = 1.3
-RADIUS = 0.62
-"""Radius of the balls that particles are drawn as, as a part of the distance that they would have on a lattice."""
 
 
 def draw_task(task: Task, path: Path) -> Path:
@@ -66,8 +65,7 @@ def draw_task(task: Task, path: Path) -> Path:
 
 
 def _draw(axis: Any, view: View, particles: Array, tools: list[Array]) -> None:
-    radius = RADIUS * (float(np.prod(np.ptp(particles, axis=0))) / len(particles)) ** (1.0 / 3.0)
-    view = dataclasses.replace(view, radius=max(radius, 1e-4))
+    view = dataclasses.replace(view, spacing=particle_spacing(particles))
     draw_scene(axis, view, particles, clay_colours(view, particles), tools, width=480)
 
 

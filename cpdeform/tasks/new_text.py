@@ -58,7 +58,7 @@ def task_text(name: str, source: str, body: dict[str, Any], tools: list[dict[str
 
 
 def _entry(fields: dict[str, Any]) -> list[str]:
-    lines = []
+    lines: list[str] = []
     for key, value in fields.items():
         text = f"{key}: {json.dumps(value) if isinstance(value, (str, list)) else value}"
         mark = "    - " if not lines else "      "

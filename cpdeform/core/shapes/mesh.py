@@ -62,7 +62,8 @@ class ShapeMesh(Shape):
         # the order of the axes is the other way round in what grid_sample takes
         at = torch.stack(places[::-1], dim=-1).reshape(1, 1, 1, -1, 3)
         found = torch.nn.functional.grid_sample(distance[None, None], at, padding_mode="border", align_corners=True)
-        return found.reshape(x.shape) + beyond
+        result: Tensor = found.reshape(x.shape) + beyond
+        return result
 
     def half_extents(self, axes: Tensor) -> Tensor:
         """See `Shape`; those of the box around the mesh's own box."""
