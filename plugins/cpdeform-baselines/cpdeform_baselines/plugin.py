@@ -64,3 +64,11 @@ def cpdeform_placers() -> list[PluginSpec]:
             summary="random contact plans with random actions",
         ),
     ]
+
+
+@hookimpl
+def cpdeform_commands() -> list[PluginSpec]:
+    """The learners."""
+    return [
+        PluginSpec(name="rl", target="cpdeform_baselines.cli:rl", summary="Train a policy on a task by reinforcement learning.")
+    ]

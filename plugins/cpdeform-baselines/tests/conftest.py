@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from cpdeform import Task
 from cpdeform.core.plugins import load_registry
@@ -25,6 +26,18 @@ def make_task(folder: Path) -> Task:
     press = torch.tensor([0.0, -1.0, 0.0]).repeat(1, 4, 1)
     np.savez(folder / "goal.npz", position=simulator.rollout(simulator.initial_state(), press).positions[0, -1].numpy())
     return task
+
+
+def write_task(task: Task, path: Path) -> Path:
+    """The task as a YAML file."""
+    path.write_text(yaml.safe_dump(task.model_dump(mode="json")), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="session")
+def task_file(task: Task, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small task as a file."""
+    return write_task(task, tmp_path_factory.mktemp("file") / "press.yaml")
 
 
 @pytest.fixture(scope="session")

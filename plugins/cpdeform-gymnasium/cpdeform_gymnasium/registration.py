@@ -88,9 +88,14 @@ def _steps(content: Mapping[str, Any]) -> int:
     """Steps of an episode: PlasticineLab's, or those of all stages where these are more."""
     try:
         stage = int(content.get("step_count", 10)) + int(content.get("rest_steps", 0))
-        return max(LEAST_STEPS, int(content.get("stage_count", 1)) * stage)
+        return episode_steps(stage, int(content.get("stage_count", 1)))
     except (TypeError, ValueError):
         return LEAST_STEPS
+
+
+def episode_steps(stage: int, stages: int) -> int:
+    """Steps of an episode, from those of a stage and the number of stages."""
+    return max(LEAST_STEPS, stages * stage)
 
 
 def _spelt(task: str) -> str:

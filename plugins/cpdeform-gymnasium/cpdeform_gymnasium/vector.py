@@ -167,6 +167,24 @@ class DeformVectorEnv(VectorEnv[Array, Array, Array]):
         if state.random_state is not None:
             self._generators[world].bit_generator.state = dict(state.random_state)
 
+    def count_step(self, terminated: Array) -> Array:
+        """Count a step that somebody else took in all worlds, such as a learner that goes through the simulator's gradient.
+
+        Args:
+            terminated: Whether each world's episode (B,) ended with it for good.
+
+        Returns:
+            Whether each world's episode (B,) is over.
+        """
+        self._elapsed += 1
+        limit = self.max_episode_steps
+        return np.asarray(terminated | (False if limit is None else self._elapsed >= limit))
+
+    def begin_anew(self, mask: Array) -> None:
+        """Begin an episode in each world that a mask (B,) chooses; the others stay as they are."""
+        for world in np.flatnonzero(mask).tolist():
+            self._begin(world)
+
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """A picture (H, W, 3) of each world; None without a render mode."""
         if self.render_mode is None:
