@@ -1,0 +1,71 @@
+"""What the further experiments run by default, and what their presets set."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from cpdeform.core.errors import UnknownNameError
+from cpdeform.experiments.experiment_plan import MULTI_STAGE, TASKS
+
+SEARCH, ABLATION, RUNTIME, RIVALS, LANDSCAPE = "search", "ablation", "runtime", "rivals", "landscape"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Study:
+    """An experiment whose figures are made from several runs.
+
+    Attributes:
+        title: What it shows.
+        methods: Methods that it compares unless others are asked for.
+        tasks: Tasks that it takes unless others are asked for.
+        equal_cost: Whether all methods may spend as much a stage as the reference did.
+    """
+
+    title: str
+    methods: tuple[str, ...]
+    tasks: tuple[str, ...] = TASKS[MULTI_STAGE]
+    equal_cost: bool = False
+
+
+STUDIES: Mapping[str, Study] = MappingProxyType(
+    {
+        SEARCH: Study(
+            title="Contact points by transport, and by searches that know nothing of it",
+            methods=("cpdeform", "random", "restarts", "bayesopt"),
+        ),
+        ABLATION: Study(title="Contact points by transport, and at random: learning curves", methods=("cpdeform", "random")),
+        RUNTIME: Study(
+            title="Best loss against wall time",
+            methods=("cpdeform", "random", "restarts", "bayesopt"),
+        ),
+        RIVALS: Study(
+            title="All methods at equal cost",
+            methods=("cpdeform", "fixed", "random", "restarts", "bayesopt", "cma", "mppi", "sampled-gradients"),
+            equal_cost=True,
+        ),
+    }
+)
+"""The experiments by name; `landscape` is of another kind."""
+
+PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        # A run within two minutes of one core: fewer particles, iterations and stages than the tasks are meant for.
+        "quick": MappingProxyType({"seeds": "0,1,2", "particles": 2000, "iterations": 8, "stages": 2}),
+        "paper": MappingProxyType({"seeds": "0,1,2,3,4"}),
+    }
+)
+"""Values of the options of `cpdeform experiment` where none are given."""
+
+
+def preset(name: str) -> Mapping[str, Any]:
+    """The values of a preset.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+    """
+    if name not in PRESETS:
+        raise UnknownNameError("--preset", name, PRESETS)
+    return PRESETS[name]
