@@ -220,7 +220,7 @@ def configure(
         values = merge(values, {"optimizer": {"iterations": iterations, "patience": iterations}})
     values = merge(values, budget or {})
     if settings.particles is not None:
-        values["scene"] = _with_particles(load_task(run.source, registry=registry), values.get("scene", {}), settings.particles)
+        values["scene"] = with_particles(load_task(run.source, registry=registry), values.get("scene", {}), settings.particles)
     if settings.goals is not None:
         values["goal"] = _goal(settings.goals, run.task)
     return resolve(validate(RunConfiguration, values, source="experiment"), registry=registry)
@@ -234,7 +234,7 @@ def _values(settings: ExperimentSettings, source: str, method: Mapping[str, Any]
     return merge(settings.options, {**given, **method, "task": source, "seed": seed})
 
 
-def _with_particles(task: Task, scene: Mapping[str, Any], total: int) -> dict[str, Any]:
+def with_particles(task: Task, scene: Mapping[str, Any], total: int) -> dict[str, Any]:
     """Changes of the scene that give its bodies `total` particles, shared out as before, at least one each."""
     counts = [body.particle_count for body in changed_task(task, scene=scene).scene.bodies]
     if total < len(counts):

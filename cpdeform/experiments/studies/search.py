@@ -30,7 +30,8 @@ def summarize(runs: Sequence[StudyRun]) -> Summary:
         lines.append([task, cell(first.value, ".4f"), *cells, cell(paper.tasks.get(family(task)), ".4f")])
         values += [_line(task, method, own[method], efforts[method]) for method in methods]
     table = markdown(["task", "initial", *methods, "CPDeform in the paper"], lines)
-    note = f'W1 at the end, and gradient evaluations. {INTERVAL_NOTE} Paper: {paper.source}, {paper.table}; "-": not known here. {paper.note}'
+    source = f'Paper: {paper.source}, {paper.table}; "-": not known here. {paper.note}'
+    note = f"W1 at the end, and gradient evaluations. {INTERVAL_NOTE} {source}"
     return Summary(values, [table, note], lambda: _draw(runs, tasks, methods))
 
 

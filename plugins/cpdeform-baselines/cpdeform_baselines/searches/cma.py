@@ -12,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from cpdeform.core.placer import Candidate, Placer, PlacerCapabilities, Proposal, Stage
-from cpdeform.core.task import Task
+from cpdeform.core.task import Task, merge
 from cpdeform.planning.phases.phase import Phase
+from cpdeform.planning.strategies.budget import search_settings
 from cpdeform.planning.strategy import Parts, Strategy
 from cpdeform_baselines.searches.common import count, rollouts_only, spread, stage_seed
 from cpdeform_baselines.searches.contacts import ContactSpace
@@ -128,8 +129,8 @@ class StrategyEvolution(Strategy):
         self.population = None if population is None else count("population", population, least=2)
 
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
-        """The placer."""
-        settings: dict[str, Any] = {"placer": "cma"}
+        """The placer, and the loss of the default strategy."""
+        settings = merge(search_settings(task), {"placer": "cma"})
         if placer in (None, "cma"):
             settings["placer_options"] = {"generations": self.generations, "population": self.population}
         return settings

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from cpdeform.core.options import real_number
 from cpdeform.core.placer import Candidate, Placer, PlacerCapabilities, Proposal, Stage
-from cpdeform.core.task import Task
+from cpdeform.core.task import Task, merge
 from cpdeform.planning.phases.phase import Phase
+from cpdeform.planning.strategies.budget import search_settings
 from cpdeform.planning.strategy import Parts, Strategy
 from cpdeform_baselines.searches.common import count, rollouts_only, spread, stage_numbers
 from cpdeform_baselines.searches.contacts import ContactSpace
@@ -154,8 +155,8 @@ class StrategyPathIntegral(Strategy):
         self.samples, self.updates = count("samples", samples), count("updates", updates)
 
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
-        """The placer."""
-        settings: dict[str, Any] = {"placer": "mppi"}
+        """The placer, and the loss of the default strategy."""
+        settings = merge(search_settings(task), {"placer": "mppi"})
         if placer in (None, "mppi"):
             settings["placer_options"] = {"samples": self.samples, "updates": self.updates}
         return settings
