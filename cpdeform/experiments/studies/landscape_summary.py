@@ -22,7 +22,7 @@ TOP_SHARE = 0.1
 
 
 def write_landscape(starts: Sequence[Start], out: Path, *, task: str, planned: int, made_by: str) -> None:
-    """Write the summary of the starts that are done.
+    """Write the summary of the starts that are done; its figure once all of them are.
 
     Args:
         starts: The starts.
@@ -50,7 +50,9 @@ def write_landscape(starts: Sequence[Start], out: Path, *, task: str, planned: i
         "landscape as a figure, without numbers."
     )
     values = [dataclasses.asdict(start) for start in starts]
-    summary = Summary(values, [markdown([f"`{task}`", ""], lines), note, made_by], lambda: _draw(starts))
+    summary = Summary(
+        values, [markdown([f"`{task}`", ""], lines), note, made_by], (lambda: _draw(starts)) if len(starts) == planned else None
+    )
     write_summary(summary, out, title=TITLE)
 
 

@@ -16,7 +16,7 @@ from cpdeform.experiments.studies.summary import Summary, write_summary
 
 
 def write_study(name: str, rows: Sequence[ExperimentRow], out: Path, *, planned: int) -> None:
-    """Write the summary of a study.
+    """Write the summary of a study; its figure once all runs are done.
 
     Args:
         name: A name of `STUDIES`.
@@ -26,7 +26,7 @@ def write_study(name: str, rows: Sequence[ExperimentRow], out: Path, *, planned:
     """
     summary = _summary(name, study_runs(rows, out), out)
     if len(rows) < planned:
-        summary = Summary(summary.values, [f"{len(rows)} of {planned} runs.", *summary.parts], summary.draw)
+        summary = Summary(summary.values, [f"{len(rows)} of {planned} runs.", *summary.parts], None)
     write_summary(summary, out, title=STUDIES[name].title)
 
 

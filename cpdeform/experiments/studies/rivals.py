@@ -134,8 +134,8 @@ def _notes(shares: Mapping[str, float]) -> str:
         f"{INTERVAL_NOTE}\n\n"
         "First table: W1 at the end, and in parentheses what the runs spent, in gradient evaluations; a rollout without gradient "
         f"counts its measured share of one ({known or 'not known'}). Every method may spend as much a stage as `{REFERENCE}` did "
-        "in the same task with the same seed (its searches are sized for that); a run ends at the first stage that finds no plan, so "
-        "that it may spend less.\n\n"
+        "in the same task with the same seed (its searches are sized for that); a run ends at the first stage that finds no plan, "
+        "so that it may spend less.\n\n"
         f"Second table: loss over the loss at the start after the last stage that ended within the wall time of `{REFERENCE}` in "
         "the same task with the same seed; in parentheses the seconds of the whole run. All runs have the same cores."
     )

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 LEVEL = 0.95
 RESAMPLES = 9999
@@ -76,17 +77,22 @@ def rank_correlation(first: Sequence[float], second: Sequence[float]) -> Interva
         first: Values.
         second: As many; pairs that are not finite do not count.
     """
-    from scipy.stats import rankdata
-
     pairs = np.array([(x, y) for x, y in zip(first, second, strict=True) if math.isfinite(x) and math.isfinite(y)])
     if len(pairs) < 3:
         return Interval(math.nan, math.nan, math.nan, len(pairs))
 
-    def correlation(chosen: np.ndarray) -> float:
-        ranks = np.stack([rankdata(chosen[:, 0]), rankdata(chosen[:, 1])])
-        return float(np.corrcoef(ranks)[0, 1]) if (np.ptp(ranks, axis=1) > 0.0).all() else math.nan
-
     generator = np.random.default_rng(SEED)
-    drawn = [correlation(pairs[generator.integers(len(pairs), size=len(pairs))]) for _ in range(RESAMPLES // 4)]
-    low, high = np.nanquantile(drawn, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])
-    return Interval(correlation(pairs), float(low), float(high), len(pairs))
+    drawn = pairs[generator.integers(len(pairs), size=(RESAMPLES // 4, len(pairs)))]
+    low, high = np.nanquantile(_spearman(drawn), [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])
+    return Interval(float(_spearman(pairs[np.newaxis])[0]), float(low), float(high), len(pairs))
+
+
+def _spearman(samples: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rank correlations (R,) of samples (R, n, 2) of pairs; nan where all values are equal."""
+    from scipy.stats import rankdata
+
+    ranks = rankdata(samples, axis=1)
+    ranks -= ranks.mean(axis=1, keepdims=True)
+    spread = np.sqrt(np.square(ranks).sum(axis=1).prod(axis=1))
+    products = ranks.prod(axis=2).sum(axis=1)
+    return np.asarray(np.divide(products, spread, out=np.full_like(spread, np.nan), where=spread > 0.0))
