@@ -147,7 +147,7 @@ def with_preset(name: str, given: dict[str, Any]) -> dict[str, Any]:
 
     if name in (ExperimentName.MULTI_STAGE, ExperimentName.SINGLE_STAGE):
         raise InputError("--preset", came=f"{wanted} with {name}", expected="none", remedy="The further experiments have presets.")
-    return given | {key: value for key, value in preset(wanted).items() if given[key] is None}
+    return given | {key: value for key, value in preset(wanted, experiment=name).items() if given[key] is None}
 
 
 def _command(name: str, given: dict[str, Any]) -> None:

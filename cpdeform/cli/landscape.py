@@ -39,8 +39,7 @@ def landscape(given: dict[str, Any]) -> None:
     from cpdeform.experiments.studies.landscape import compute
     from cpdeform.run.record_files import check_directory
 
-    # Presets size runs of several stages and seeds; a landscape has one of each.
-    others = [key for key, value in given.items() if key not in TAKEN and value not in (None, False) and key != "stages"]
+    others = [key for key, value in given.items() if key not in TAKEN and value not in (None, False)]
     if others:
         raise InputError("landscape", came=", ".join(f"--{key.replace('_', '-')}" for key in others), expected="other options")
     registry = load_registry()

@@ -78,7 +78,7 @@ def test_rank_correlations():
 
 
 def test_presets_stay_below_what_a_task_asks_for():
-    assert PRESETS["quick"]["particles"] < 6000
+    assert PRESETS["quick"]["stages"] == 1
     assert set(PRESETS["paper"]) == {"seeds"}
     assert all(study.methods[0] == "cpdeform" for study in STUDIES.values())
 
@@ -191,6 +191,7 @@ def test_an_interrupted_study_gives_the_table_of_an_uninterrupted_one(folder, mo
         ("rivals", ["--methods", "fixed,random"], "methods with cpdeform"),
         ("landscape", ["--methods", "fixed"], "--methods"),
         ("landscape", ["--size", "1"], "--size"),
+        ("landscape", ["--stages", "2"], "--stages"),
         ("landscape", ["--tasks", "writer,star"], "one task"),
     ],
 )
@@ -227,3 +228,27 @@ def test_a_landscape_goes_on_where_it_was(folder, monkeypatch):
     # Another setting makes other rows.
     assert experiment("landscape", *PARTS, "--size", "2", "--iterations", "2", "--out", "broken").exit_code == 0
     assert len(values("broken")) == 4
+
+
+def test_cards_say_what_the_table_says(folder):
+    Path("table").mkdir()
+    lines = [
+        "writer-v2,cpdeform,3,0.0010,0.0009,0.0011,24",
+        "writer-v2,random,3,0.0013,0.0012,0.0014,24",
+        "star,cma,1,nan,nan,nan,",
+    ]
+    Path("table/summary.csv").write_text("task,method,seeds,w1_final,w1_final_low,w1_final_high,cost\n" + "\n".join(lines) + "\n")
+    finished = CliRunner().invoke(app, ["bench", "cards", "table/summary.csv", "--out", "cards"])
+    assert finished.exit_code == 0, finished.output
+    card = Path("cards/writer-v2.md").read_text()
+    assert "| cpdeform | 3 | 0.0010 [0.0009, 0.0011] | 24 |" in card
+    assert card.index("| cpdeform |") < card.index("| random |")
+    for part in ("10000 particles", "Capsule", "those of the body, moved", "1 stage of 10 environment steps", "(writer-v2.png)"):
+        assert part in card
+    assert "| cma | 1 | - |" in Path("cards/star.md").read_text()
+    assert Path("cards/writer-v2.png").read_bytes().startswith(b"\x89PNG")
+    assert "[star](star.md)" in Path("cards/README.md").read_text()
+    Path("other.csv").write_text("a,b\n1,2\n")
+    refused = CliRunner().invoke(app, ["bench", "cards", "other.csv"])
+    assert refused.exit_code == 2
+    assert "without task, method" in refused.stderr

@@ -157,6 +157,8 @@ def _draw(tasks: Sequence[str], methods: Sequence[str], found: Mapping[tuple[str
         axis.set_yticks(range(len(others)), others, fontsize=7)
         axis.invert_yaxis()
         axis.tick_params(axis="x", labelsize=7)
+        axis.locator_params(axis="x", nbins=4)
+        axis.ticklabel_format(axis="x", style="sci", scilimits=(-2, 2))
         axis.set_title(task, fontsize=9)
         axis.set_xlabel(f"W1 minus that of {REFERENCE}", fontsize=7)
     for axis in axes[len(tasks) :]:
