@@ -82,9 +82,13 @@ def rank_correlation(first: Sequence[float], second: Sequence[float]) -> Interva
         return Interval(math.nan, math.nan, math.nan, len(pairs))
 
     generator = np.random.default_rng(SEED)
-    drawn = pairs[generator.integers(len(pairs), size=(RESAMPLES // 4, len(pairs)))]
-    low, high = np.nanquantile(_spearman(drawn), [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])
-    return Interval(float(_spearman(pairs[np.newaxis])[0]), float(low), float(high), len(pairs))
+    value = float(_spearman(pairs[np.newaxis])[0])
+    drawn = _spearman(pairs[generator.integers(len(pairs), size=(RESAMPLES // 4, len(pairs)))])
+    known = drawn[np.isfinite(drawn)]
+    if not len(known):
+        return Interval(value, math.nan, math.nan, len(pairs))
+    low, high = np.quantile(known, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])
+    return Interval(value, float(low), float(high), len(pairs))
 
 
 def _spearman(samples: NDArray[np.float64]) -> NDArray[np.float64]:
