@@ -32,6 +32,7 @@ class Painter:
     def __init__(self, scene: Scene, goal: Tensor) -> None:
         from cpdeform.core.sampling import sample_particles
         from cpdeform.report.render import fit_camera
+        from cpdeform.report.surface import particle_spacing
 
         self._scene = scene
         clay = np.concatenate([sample_particles(scene), goal.detach().double().cpu().numpy()])
@@ -42,7 +43,7 @@ class Painter:
         corners = centre + half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         self._camera = fit_camera(corners, azimuth=AZIMUTH, elevation=ELEVATION, aspect=ASPECT)
         self._low, self._high = float(clay[:, 1].min()), float(clay[:, 1].max())
-        self._radius = _radius(sample_particles(scene))
+        self._spacing = particle_spacing(sample_particles(scene))
 
     def paint(self, state: State) -> NDArray[np.uint8]:
         """A picture (H, W, 3) of a single world."""
@@ -54,7 +55,7 @@ class Painter:
         stops = np.linspace(0.0, 1.0, len(CLAY))
         colours = np.stack([np.interp(height, stops, CLAY[:, channel]) for channel in range(3)], axis=-1)
         picture = render(
-            self._camera, width=WIDTH, particles=particles, colours=colours, radius=self._radius, tools=tools, quality=1
+            self._camera, width=WIDTH, particles=particles, colours=colours, spacing=self._spacing, tools=tools, quality=1
         )
         alpha = picture[..., 3:]
         return np.asarray(np.rint(255.0 * (alpha * picture[..., :3] + 1.0 - alpha)), dtype=np.uint8)
@@ -64,11 +65,3 @@ class Painter:
 
         tools = zip(self._scene.tools, poses, strict=True)
         return [tool_surface(tool, pose, rows=rows, columns=columns) for tool, pose in tools]
-
-
-def _radius(positions: NDArray[np.float64]) -> float:
-    """Radius at which the balls of a cloud (N, 3) touch and close its surface, length units."""
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(positions).query(positions, k=min(8, len(positions)))
-    return float(np.clip(0.95 * np.median(np.atleast_2d(distance)[:, -1]), 1e-3, 0.05))
