@@ -19,6 +19,8 @@ run: $(NATIVE)
 test: $(NATIVE)
 	$(BIN)/python -m pytest
 	cd plugins/cpdeform-example && ../../$(BIN)/python -m pytest
+	cd plugins/cpdeform-gymnasium && ../../$(BIN)/python -m pytest
+	cd plugins/cpdeform-baselines && ../../$(BIN)/python -m pytest
 ifneq ($(COMPILER),)
 	cd plugins/cpdeform-native && ../../$(BIN)/python -m pytest
 endif
@@ -40,6 +42,8 @@ lint: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	cd plugins/cpdeform-example && ../../$(BIN)/mypy
+	cd plugins/cpdeform-gymnasium && ../../$(BIN)/mypy
+	cd plugins/cpdeform-baselines && ../../$(BIN)/mypy
 	cd plugins/cpdeform-native && ../../$(BIN)/mypy
 
 # All 53 take two minutes with the native simulator, which is why it is built first; six times as long with Warp.
@@ -67,11 +71,12 @@ else
 		../../$(BIN)/python -m pytest -p no:cacheprovider $(SANITIZE_TESTS)
 endif
 
-$(INSTALLED): pyproject.toml constraints.txt
+$(INSTALLED): pyproject.toml constraints.txt plugins/cpdeform-gymnasium/pyproject.toml plugins/cpdeform-baselines/pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch==2.13.0
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-deps --editable plugins/cpdeform-example
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable plugins/cpdeform-gymnasium --editable plugins/cpdeform-baselines
 	touch $(INSTALLED)
 
 # The C++ simulator and transport solver. Without a compiler the other backends take their place.

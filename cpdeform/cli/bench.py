@@ -10,16 +10,20 @@ from typing import Annotated
 
 import typer
 
+from cpdeform.cli.bench_cards import bench_cards_command
 from cpdeform.cli.bench_ot import bench_ot_command
 from cpdeform.cli.bench_output import check_device, report, split_names, split_numbers, told
 from cpdeform.cli.bench_run import bench_run_command
 
-bench = typer.Typer(no_args_is_help=True, help="Measure what parts cost on this machine, each measurement in a fresh process.")
+bench = typer.Typer(
+    no_args_is_help=True, help="Measure what parts cost on this machine, each measurement in a fresh process; benchmark cards."
+)
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line: rows, machine, versions, settings.")]
 
 bench.command("ot")(bench_ot_command)
 bench.command("run")(bench_run_command)
+bench.command("cards")(bench_cards_command)
 
 SIMULATOR_COLUMNS: Mapping[str, tuple[str, str]] = {
     "backend": ("backend", ""),

@@ -31,13 +31,20 @@ class ExperimentName(enum.StrEnum):
 
     MULTI_STAGE = "multi-stage"
     SINGLE_STAGE = "single-stage"
+    SEARCH = "search"
+    ABLATION = "ablation"
+    RUNTIME = "runtime"
+    LANDSCAPE = "landscape"
+    RIVALS = "rivals"
 
 
 def experiment(
     name: Annotated[
         ExperimentName,
         typer.Argument(
-            help="multi-stage: judged by W1 to the goal; single-stage: by the normalised incremental IoU.", metavar="NAME"
+            help="multi-stage: judged by W1 to the goal; single-stage: by the normalised incremental IoU; search, ablation, "
+            "runtime, landscape, rivals: see docs/experiments.md.",
+            metavar="NAME",
         ),
     ],
     tasks: Annotated[
@@ -50,7 +57,11 @@ def experiment(
     ] = None,
     methods: Annotated[
         str | None,
-        typer.Option(help="Of cpdeform, paper, fixed, random, separated by commas. Defaults to cpdeform,fixed.", metavar="NAMES"),
+        typer.Option(
+            help="Of cpdeform, tuned, paper, fixed, random, restarts, bayesopt, cma, mppi and sampled-gradients, separated by "
+            "commas. Defaults to cpdeform,fixed, or those of the experiment.",
+            metavar="NAMES",
+        ),
     ] = None,
     seeds: Annotated[str | None, typer.Option(help="Seeds, separated by commas. Defaults to 0.", metavar="NUMBERS")] = None,
     iterations: Annotated[int | None, typer.Option(help="The most gradient steps a stage. Defaults to the task's, or 40.")] = None,
@@ -75,6 +86,13 @@ def experiment(
     ] = False,
     paper_metric: Annotated[bool, typer.Option("--paper-metric", help="Also take W1 with the paper's settings.")] = False,
     shape: Annotated[bool, typer.Option("--shape", help="Also take the shape figures, from rest to rest.")] = False,
+    preset: Annotated[
+        str | None,
+        typer.Option(
+            help="quick: small, for a look; paper: the tasks as they are, five seeds. Other options override it.", metavar="NAME"
+        ),
+    ] = None,
+    size: Annotated[int | None, typer.Option(help="(landscape) Starts along x and along z. Defaults to 20.")] = None,
     out: Annotated[
         Path | None, typer.Option(help="Directory of records and tables. Defaults to experiments/<experiment>.", metavar="DIR")
     ] = None,
@@ -100,17 +118,40 @@ def experiment(
 
     Exit code 0: there are figures; 1: no run has any; 2: unusable input; 130: interrupted (the table holds what was done).
     """
-    given = locals()
-    if name is ExperimentName.MULTI_STAGE and variants is not None:
-        raise InputError("--variants", came=variants, expected="none with multi-stage", remedy="Its tasks have no variants.")
-    given["variants"] = "" if name is ExperimentName.MULTI_STAGE else variants or "v1,v2,v3"
+    given = with_preset(name.value, locals())
+    if name is ExperimentName.LANDSCAPE:
+        from cpdeform.cli.landscape import landscape
+
+        landscape({key: value for key, value in given.items() if key != "name"})
+        return
+    if given.pop("size") is not None:
+        raise InputError("--size", came=str(size), expected=f"none with {name.value}", remedy="It is the landscape's.")
+    single = name is ExperimentName.SINGLE_STAGE
+    if not single and variants is not None:
+        raise InputError("--variants", came=variants, expected=f"none with {name.value}", remedy="Name the task with its variant.")
+    given["variants"] = variants or "v1,v2,v3" if single else ""
     _command(given.pop("name").value, given)
+
+
+def with_preset(name: str, given: dict[str, Any]) -> dict[str, Any]:
+    """The options with what the preset says where none were given.
+
+    Raises:
+        UnknownNameError: There is no such preset.
+        InputError: The experiment has none.
+    """
+    wanted = given.pop("preset")
+    if wanted is None:
+        return given
+    from cpdeform.experiments.studies.study import preset
+
+    if name in (ExperimentName.MULTI_STAGE, ExperimentName.SINGLE_STAGE):
+        raise InputError("--preset", came=f"{wanted} with {name}", expected="none", remedy="The further experiments have presets.")
+    return given | {key: value for key, value in preset(wanted, experiment=name).items() if given[key] is None}
 
 
 def _command(name: str, given: dict[str, Any]) -> None:
     """Run an experiment, or only make its tables, and print the outcome."""
-    from cpdeform.experiments.experiment_tables import write_tables
-
     as_json, no_run, resume = (given.pop(key) for key in ("as_json", "no_run", "resume"))
     where = {key: given.pop(key) for key in ("engine", "workers")}
     given["out"] = given["out"] or Path("experiments") / name
@@ -120,7 +161,7 @@ def _command(name: str, given: dict[str, Any]) -> None:
         source, planned, settings = _recorded(name, given) if no_run else _run(name, given, where, resume=resume)
         if no_run:
             rows.extend(source)
-            write_tables(name, rows, given["out"], planned=planned)
+            _write(name, rows, given["out"], planned=planned)
         else:
             _collect(name, rows, source, given["out"], planned=planned)
     _report(name, rows, settings, given["out"], as_json=as_json)
@@ -128,17 +169,27 @@ def _command(name: str, given: dict[str, Any]) -> None:
 
 def _collect(name: str, rows: list[ExperimentRow], source: Iterator[ExperimentRow], out: Path, *, planned: int) -> None:
     """Take rows as they come; the tables are written after each."""
-    from cpdeform.experiments.experiment_tables import write_tables
-
     try:
         for row in source:
             rows.append(row)
-            write_tables(name, rows, out, planned=planned)
+            _write(name, rows, out, planned=planned)
             typer.echo(f"{len(rows)}/{planned}  {_row_line(row)}", err=True)
     except KeyboardInterrupt as error:
         left = f"{out / 'table.md'} holds the {len(rows)} runs that are done" if rows else "no run was done"
         typer.echo(f"cpdeform: interrupted; {left}; the same command goes on from here", err=True)
         raise typer.Exit(exit_code(error)) from error
+
+
+def _write(name: str, rows: Sequence[ExperimentRow], out: Path, *, planned: int) -> None:
+    """Write the tables, and the summary of a study."""
+    from cpdeform.experiments.experiment_tables import sorted_rows, write_tables
+    from cpdeform.experiments.studies.study import STUDIES
+
+    write_tables(name, rows, out, planned=planned)
+    if name in STUDIES:
+        from cpdeform.experiments.studies.report import write_study
+
+        write_study(name, sorted_rows(rows), out, planned=planned)
 
 
 def _recorded(name: str, given: dict[str, Any]) -> tuple[Iterator[ExperimentRow], int, dict[str, Any]]:
@@ -186,9 +237,13 @@ def _run(
 def _settings(name: str, given: dict[str, Any], registry: Registry) -> ExperimentSettings:
     from cpdeform.core.plugins import split_options
     from cpdeform.experiments.experiment_plan import TASKS, ExperimentSettings, expand_tasks
+    from cpdeform.experiments.studies.study import STUDIES
 
     values = {key: value for key, value in given.items() if value is not None}
-    names = split_names(values.pop("tasks"), "--tasks") if "tasks" in values else TASKS[name]
+    study = STUDIES.get(name)
+    names = split_names(values.pop("tasks"), "--tasks") if "tasks" in values else study.tasks if study else TASKS[name]
+    if study is not None:
+        values = {"methods": ",".join(study.methods), "equal_cost": study.equal_cost, **values}
     variants = values.pop("variants")
     tasks = expand_tasks(names, split_names(variants, "--variants") if variants else (), registry=registry)
     if "device" in values:
@@ -274,20 +329,23 @@ def _row_line(row: ExperimentRow) -> str:
 def _report(name: str, rows: Sequence[ExperimentRow], settings: dict[str, Any], out: Path, *, as_json: bool) -> None:
     """Print the tables, or one JSON object; exit code 1 where no run has figures."""
     from cpdeform.experiments.experiment_tables import TABLE_FILE, paper_figures, read_sessions, sorted_rows
+    from cpdeform.experiments.studies.study import STUDIES
+    from cpdeform.experiments.studies.summary import SUMMARY_FILE
     from cpdeform.run.record_files import to_json
 
     if as_json:
         content = {
             "experiment": name,
             "rows": [dataclasses.asdict(row) for row in sorted_rows(rows)],
-            "paper": dataclasses.asdict(paper_figures(name)),
+            "paper": dataclasses.asdict(paper_figures("single-stage" if name == "single-stage" else "multi-stage")),
             "sessions": read_sessions(out),
             "settings": settings,
             "out": str(out),
         }
         typer.echo(json.dumps(to_json(content), default=str))
     else:
-        print_markdown((out / TABLE_FILE).read_text(encoding="utf-8"))
-        typer.echo(f"written to {out / TABLE_FILE}")
+        summary = out / SUMMARY_FILE if name in STUDIES else out / TABLE_FILE
+        print_markdown(summary.read_text(encoding="utf-8"))
+        typer.echo(f"written to {summary}")
     if not any(row.has_figures for row in rows):
         raise typer.Exit(1)

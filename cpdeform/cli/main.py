@@ -7,7 +7,6 @@ import warnings
 from typing import Annotated, Any, TextIO
 
 import typer
-from typer.core import TyperGroup
 
 from cpdeform import __version__
 from cpdeform.cli.bench import bench
@@ -17,6 +16,7 @@ from cpdeform.cli.doctor import doctor
 from cpdeform.cli.evaluate import evaluate
 from cpdeform.cli.experiment import experiment
 from cpdeform.cli.interruption import exit_code, interruptible
+from cpdeform.cli.plugin_commands import PluginGroup
 from cpdeform.cli.plugins import plugins
 from cpdeform.cli.recorded import config, replay, verify
 from cpdeform.cli.report import draw, report, view
@@ -29,7 +29,7 @@ from cpdeform.cli.tasks import tasks
 from cpdeform.core.errors import CpdeformError
 
 
-class ErrorGroup(TyperGroup):
+class ErrorGroup(PluginGroup):
     """Commands whose deliberate errors, and limits of the system, are one message on stderr and exit code 2; all else is a bug."""
 
     def invoke(self, ctx: Any) -> Any:

@@ -68,6 +68,15 @@ def cpdeform_engines() -> list[PluginSpec]:  # type: ignore[empty-body]
 
 
 @hookspec
+def cpdeform_commands() -> list[PluginSpec]:  # type: ignore[empty-body]
+    """Register commands of the command line: functions whose annotated parameters Typer reads, such as `cpdeform.cli.run.run`.
+
+    ``name="rl"`` becomes `cpdeform rl`. The function is imported when the command is called; errors that it raises on purpose
+    (`cpdeform.core.errors.CpdeformError`) are told in a line, as those of the built-in commands are.
+    """
+
+
+@hookspec
 def cpdeform_stage_finished(result: Any) -> None:
     """Observe a finished stage, a `cpdeform.planning.result.StageResult`."""
 

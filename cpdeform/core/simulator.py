@@ -172,6 +172,20 @@ class Simulator(Portable, abc.ABC):
                 still end in numbers that are not finite.
         """
 
+    def simulate(self, state: State, actions: Tensor) -> Trajectory:
+        """Simulate T environment steps without a way back: as `rollout`, but the trajectory keeps no checkpoints.
+
+        Backends that can skip the work of keeping them override this; the numbers are those of `rollout`.
+
+        Args:
+            state: As for `rollout`.
+            actions: As for `rollout`.
+
+        Raises:
+            InputError: As for `rollout`.
+        """
+        return dataclasses.replace(self.rollout(state, actions), checkpoints=None)
+
     @abc.abstractmethod
     def vjp(
         self,

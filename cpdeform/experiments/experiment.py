@@ -27,7 +27,7 @@ from cpdeform.sweep.worker import Outcome, Worker, WorkSettings, return_lost
 Observe = Callable[[PlannedRun], AbstractContextManager[Sequence[Observer]]]
 """Gives the observers of a run, for as long as it goes on."""
 
-RECORD_PATTERN = re.compile(rf"({'|'.join(METHODS)})-seed(\d+)")
+RECORD_PATTERN = re.compile(rf"({'|'.join(map(re.escape, METHODS))})-seed(\d+)")
 
 
 def run_experiment(

@@ -16,6 +16,7 @@ from cpdeform.core.plugins import load_registry
 from cpdeform.core.task import Task
 from cpdeform.experiments.experiment_plan import BASELINE, REFERENCE, ExperimentSettings, PlannedRun, configure, record_directory
 from cpdeform.experiments.experiment_row import OVER, ExperimentRow, forget, forget_failure, note_failure, read_row
+from cpdeform.experiments.studies.equal_cost import budget_values, rollout_share
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record_files import RUN_FILE
 from cpdeform.run.record_reader import load_record
@@ -42,7 +43,7 @@ def experiment_jobs(settings: ExperimentSettings, runs: Sequence[PlannedRun], *,
         source = str(Path(run.source).resolve()) if run.source.endswith((".yaml", ".yml")) else run.source
         # The record's place is the job's own; a task of the list may have another name than its file.
         asked = {"task": run.task, "source": source, "method": run.method, "seed": run.seed}
-        waits = settings.equal_evaluations and run.method == BASELINE
+        waits = (settings.equal_evaluations and run.method == BASELINE) or (settings.equal_cost and run.method != REFERENCE)
         job = Job(
             name=_name(run.task, run.method, run.seed),
             record=run.directory.relative_to(settings.out).as_posix(),
@@ -63,13 +64,7 @@ def do_experiment_run(context: JobContext) -> dict[str, Any]:
     settings = _settings(request["settings"], context.sweep)
     run = PlannedRun(**request["run"], directory=context.place)
     try:
-        iterations = None
-        if context.job.after is not None:
-            reference = dataclasses.replace(
-                run, method=REFERENCE, directory=record_directory(settings.out, run.task, REFERENCE, run.seed)
-            )
-            iterations = evaluations_per_stage(read_row(reference, paper_metric=False, reused=True))
-        resolved = configure(run, settings, registry=load_registry(), iterations=iterations)
+        resolved = _configured(context, run, settings)
         if request["resume"] and is_done(context.place, resolved.configuration, resolved.task):
             forget_failure(run)
             return {"reused": True}
@@ -90,6 +85,27 @@ def do_experiment_run(context: JobContext) -> dict[str, Any]:
         reused=False,
     )
     return {"reused": False}
+
+
+def _configured(context: JobContext, run: PlannedRun, settings: ExperimentSettings) -> ResolvedRun:
+    """A run, ready to start, with the budget that it has beside the reference."""
+    registry, reference = load_registry(), None
+    if context.job.after is not None:
+        directory = record_directory(settings.out, run.task, REFERENCE, run.seed)
+        made = dataclasses.replace(run, method=REFERENCE, directory=directory)
+        reference = read_row(made, paper_metric=False, reused=True)
+    if settings.equal_evaluations and reference is not None:
+        return configure(run, settings, registry=registry, iterations=evaluations_per_stage(reference))
+    plain = configure(run, settings, registry=registry)
+    if not settings.equal_cost:
+        return plain
+    # Measured with the first run, that of the reference, so that it is there whatever comes of that.
+    share = rollout_share(plain.task, plain.configuration, settings.out, registry=registry)
+    if reference is None or not reference.stages_tried or reference.gradient_evaluations is None:
+        return plain
+    cost = (reference.gradient_evaluations + share * (reference.rollouts or 0)) / reference.stages_tried
+    budget = budget_values(run.method, cost, share=share, iterations=plain.configuration.optimizer.iterations)
+    return configure(run, settings, registry=registry, budget=budget)
 
 
 def _make(context: JobContext, resolved: ResolvedRun) -> None:

@@ -35,10 +35,15 @@ METHODS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "paper": {"placer": "transport", "strategy": "paper"},
         "fixed": {"placer": "fixed"},
         "random": {"placer": "random"},
+        "restarts": {"strategy": "restarts"},
+        "bayesopt": {"strategy": "bayesopt"},
+        "cma": {"strategy": "cma"},
+        "mppi": {"strategy": "mppi"},
+        "sampled-gradients": {"strategy": "sampled-gradients"},
     }
 )
 """What each method sets: this project's method, the same with settings tuned for each of the paper's tasks, Algorithm 1 to the
-letter, PlasticineLab's protocol, the paper's ablation."""
+letter, PlasticineLab's protocol, the paper's ablation, and the searches of the distribution cpdeform-baselines."""
 
 REFERENCE, BASELINE = "cpdeform", "fixed"
 """With equal evaluations the second gets as many as the first one used."""
@@ -70,6 +75,7 @@ class ExperimentSettings:
         equal_evaluations: Give ``fixed`` as many gradient evaluations per stage as ``cpdeform`` used.
         paper_metric: Also take W1 with the paper's settings.
         shape: Also take the shape figures, from rest to rest.
+        equal_cost: Let every method spend as much a stage as ``cpdeform`` did, in gradient evaluations.
 
     Raises:
         InputError: A list is empty or holds something twice, a number is out of range, a method is unknown, or an option is one
@@ -92,6 +98,7 @@ class ExperimentSettings:
     equal_evaluations: bool = False
     paper_metric: bool = False
     shape: bool = False
+    equal_cost: bool = False
 
     def __post_init__(self) -> None:
         for name in ("tasks", "methods", "seeds"):
@@ -112,6 +119,9 @@ class ExperimentSettings:
                 raise InputError("--set", came=f'"{field}"', expected="another field", remedy=f"Use {option} instead.")
         if self.equal_evaluations and not {REFERENCE, BASELINE} <= set(self.methods):
             raise InputError("--equal-evaluations", came=", ".join(self.methods), expected=f"methods {REFERENCE} and {BASELINE}")
+        if self.equal_cost and (REFERENCE not in self.methods or self.equal_evaluations):
+            expected = f"methods with {REFERENCE}, and not --equal-evaluations"
+            raise InputError("--methods", came=", ".join(self.methods), expected=expected)
         if self.goals is not None and not self.goals.is_dir():
             raise InputError("--goals", came=str(self.goals), expected="a directory")
 
@@ -165,6 +175,9 @@ def planned_runs(settings: ExperimentSettings, *, registry: Registry) -> list[Pl
             raise InputError("--tasks", came=f"{tasks[name]} and {source}, both named {name}", expected="tasks of different names")
         tasks[name] = source
     validate(RunConfiguration, _values(settings, "writer", METHODS[settings.methods[0]], 0), source="experiment")
+    for method in settings.methods:
+        if "strategy" in METHODS[method]:
+            registry.find("strategy", METHODS[method]["strategy"])
     for kind, part in (("simulator", settings.backend), ("ot_solver", settings.ot)):
         if part is not None:
             registry.resolve(kind, part, device=settings.device or "cpu")
@@ -182,7 +195,14 @@ def record_directory(out: Path, task: str, method: str, seed: int) -> Path:
     return out / re.sub(r"[^\w.+-]", "_", task) / f"{method}-seed{seed}"
 
 
-def configure(run: PlannedRun, settings: ExperimentSettings, *, registry: Registry, iterations: int | None = None) -> ResolvedRun:
+def configure(
+    run: PlannedRun,
+    settings: ExperimentSettings,
+    *,
+    registry: Registry,
+    iterations: int | None = None,
+    budget: Mapping[str, Any] | None = None,
+) -> ResolvedRun:
     """A run, ready to start.
 
     Args:
@@ -190,6 +210,7 @@ def configure(run: PlannedRun, settings: ExperimentSettings, *, registry: Regist
         settings: Those of the experiment.
         registry: Where names are looked up.
         iterations: Gradient evaluations of each stage, all of which are made; defaults to those of `settings`.
+        budget: Fields of the configuration that size the run, above those of `settings`.
 
     Raises:
         InputError: The task, its goal or an option cannot be used.
@@ -197,8 +218,9 @@ def configure(run: PlannedRun, settings: ExperimentSettings, *, registry: Regist
     values = _values(settings, run.source, METHODS[run.method], run.seed)
     if iterations is not None:
         values = merge(values, {"optimizer": {"iterations": iterations, "patience": iterations}})
+    values = merge(values, budget or {})
     if settings.particles is not None:
-        values["scene"] = _with_particles(load_task(run.source, registry=registry), values.get("scene", {}), settings.particles)
+        values["scene"] = with_particles(load_task(run.source, registry=registry), values.get("scene", {}), settings.particles)
     if settings.goals is not None:
         values["goal"] = _goal(settings.goals, run.task)
     return resolve(validate(RunConfiguration, values, source="experiment"), registry=registry)
@@ -212,7 +234,7 @@ def _values(settings: ExperimentSettings, source: str, method: Mapping[str, Any]
     return merge(settings.options, {**given, **method, "task": source, "seed": seed})
 
 
-def _with_particles(task: Task, scene: Mapping[str, Any], total: int) -> dict[str, Any]:
+def with_particles(task: Task, scene: Mapping[str, Any], total: int) -> dict[str, Any]:
     """Changes of the scene that give its bodies `total` particles, shared out as before, at least one each."""
     counts = [body.particle_count for body in changed_task(task, scene=scene).scene.bodies]
     if total < len(counts):

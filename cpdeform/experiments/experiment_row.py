@@ -80,6 +80,7 @@ class ExperimentRow:
         distance_95_result_to_goal: See there, in cells.
         distance_95_goal_to_result: See there, in cells.
         gradient_evaluations: Gradient evaluations of all stages and worlds.
+        rollouts: Rollouts without a gradient of all stages and worlds.
         iterations: The most gradient evaluations per stage and world.
         seconds: Wall time of the run.
         reused: Whether the run was found, not made.
@@ -118,6 +119,7 @@ class ExperimentRow:
     distance_95_result_to_goal: float | None = None
     distance_95_goal_to_result: float | None = None
     gradient_evaluations: int | None = None
+    rollouts: int | None = None
     iterations: int | None = None
     seconds: float | None = None
     reused: bool = False
@@ -204,6 +206,7 @@ def _recorded_row(record: RunRecord, base: Mapping[str, Any], *, paper_metric: b
         "particles": record.task.scene.particle_count,
         "metric": record.task.metric,
         "gradient_evaluations": sum(stage.gradient_evaluations for stage in record.stages),
+        "rollouts": sum(stage.rollouts for stage in record.stages),
         "iterations": configuration.optimizer.iterations,
         "seconds": record.run.get("seconds", sum(stage.seconds["total"] for stage in record.stages)),
         "configuration": configuration.model_dump(mode="json"),

@@ -49,6 +49,7 @@ COLUMNS: Mapping[str, tuple[str, str]] = {
     "distance_95_result_to_goal": ("95% distance to goal, cells", ".1f"),
     "distance_95_goal_to_result": ("95% distance from goal, cells", ".1f"),
     "gradient_evaluations": ("gradient evaluations", "d"),
+    "rollouts": ("rollouts", "d"),
     "seconds": ("seconds", ".0f"),
 }
 """Title and format of the columns of the table of runs."""
@@ -114,7 +115,7 @@ def write_tables(name: str, rows: Sequence[ExperimentRow], out: Path, *, planned
     """Write ``table.md`` and ``table.csv``.
 
     Args:
-        name: ``"multi-stage"`` or ``"single-stage"``.
+        name: Name of the experiment.
         rows: A row for each run that is done.
         out: Where to write.
         planned: Number of runs asked for.
@@ -146,7 +147,8 @@ def csv_text(rows: Iterable[ExperimentRow]) -> str:
 
 def table_text(name: str, rows: Sequence[ExperimentRow], *, sessions: Sequence[Mapping[str, Any]], planned: int) -> str:
     """The whole of ``table.md``; arguments as for `write_tables`."""
-    paper = paper_figures(name)
+    kind = SINGLE_STAGE if name == SINGLE_STAGE else MULTI_STAGE
+    paper = paper_figures(kind)
     done = f"{len(rows)} of {planned} runs" if len(rows) < planned else f"{planned} run{'s' if planned != 1 else ''}"
     parts = [f"# Experiment {name}", f"{done}.", runs_table(rows), *_reasons(rows), NOTES]
     if any(row.goal_particles not in (None, row.particles) for row in rows):
@@ -156,11 +158,11 @@ def table_text(name: str, rows: Sequence[ExperimentRow], *, sessions: Sequence[M
     blurs = sorted({row.w1_paper_blur for row in rows if row.w1_paper_blur is not None})
     if blurs:
         parts.append(f"Paper's W1: GeomLoss's default schedule, blur {' or '.join(f'{blur:g}' for blur in blurs)}, not converged.")
-    for figure in SHORT_TABLES[name]:
+    for figure in SHORT_TABLES[kind]:
         table = short_table(rows, figure, paper=paper)
         if table:
             parts += [f"## {FIGURES[figure][0]}", table]
-    parts += [f'{_means_note(name)} Paper: {paper.source}, {paper.table}; "-": not known to this project. {paper.note}']
+    parts += [f'{_means_note(kind)} Paper: {paper.source}, {paper.table}; "-": not known to this project. {paper.note}']
     parts += ["## Settings and hardware", *_settings_lines(rows), *_session_lines(sessions)]
     return "\n\n".join(parts) + "\n"
 

@@ -79,7 +79,8 @@ class Evaluator:
         """Roll out, take the loss and, if asked for, the gradient."""
         gauge = _gauge(self.simulator) if batch.measured else None
         marks = [time.perf_counter()]
-        trajectory = self.simulator.rollout(batch.state, batch.actions)
+        run = self.simulator.rollout if self.with_gradient else self.simulator.simulate
+        trajectory = run(batch.state, batch.actions)
         finite = torch.isfinite(trajectory.positions).flatten(1).all(dim=1)
         marks.append(time.perf_counter())
         # The gauge leaves out the objective, whose memory no estimate covers.

@@ -2,34 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from cpdeform.core.plugins import Registry, load_registry
-from cpdeform.core.sampling import sample_particles
-from cpdeform.core.state import tool_pose
-from cpdeform.core.task import Task, list_variants, load_task, task_path
-from cpdeform.report.pictures import View, clay_colours, draw_scene
-from cpdeform.report.render import fit_camera
-from cpdeform.report.shapes import tool_surface
-from cpdeform.report.surface import particle_spacing
+from cpdeform.core.task import list_variants, load_task, task_path
+from cpdeform.report.task_panels import PANEL_ASPECT, draw_start_and_goal, save_picture
 
-Array = NDArray[np.float64]
-
-DIRECTION = (28.0, 42.0)
-"""Azimuth and elevation, degrees, from which a task is drawn."""
-
-DIRECTIONS: Mapping[str, tuple[float, float]] = MappingProxyType({"writer++": (6.0, 66.0)})
-"""Those of tasks that show their shape from elsewhere: letters are read from above."""
-
-PANEL_ASPECT = 1.3
 PANEL_WIDTHS = {True: 2.2, False: 3.6}
 """Width of a panel on sheets of tasks with variants and on the others, inches of 100 pixels."""
 
@@ -83,45 +66,9 @@ def draw_sheet(names: tuple[str, ...], path: Path, *, registry: Registry) -> Pat
     for row, tasks in enumerate(columns):
         for column, name in enumerate(tasks):
             task = load_task(name, registry=registry)
-            _draw_pair(axes[2 * row, column], axes[2 * row + 1, column], task, width=int(110 * panel))
-    _save(canvas, path)
+            draw_start_and_goal(axes[2 * row, column], axes[2 * row + 1, column], task, width=int(110 * panel))
+    save_picture(canvas, path)
     return path
-
-
-def _draw_pair(upper: Any, lower: Any, task: Task, *, width: int) -> None:
-    """Draw a task's start with its tools above, its goal below, each `width` pixels wide."""
-    start, goal = sample_particles(task.scene), task.load_goal()
-    pose = tool_pose(task.scene).numpy()
-    tools = [tool_surface(tool, pose[index], rows=220, columns=320) for index, tool in enumerate(task.scene.tools)]
-    # A fixed pillar may reach far below the floor; that part is not worth the room.
-    tools = [np.maximum(surface, (-np.inf, task.scene.ground_height, -np.inf)) for surface in tools]
-    view = _make_view(task, start, goal, tools)
-    draw_scene(upper, view, start, clay_colours(view, start), tools, width=width)
-    upper.set_title(f"{task.name}: start", fontsize=7, pad=1.5)
-    view = dataclasses.replace(view, spacing=particle_spacing(goal))
-    draw_scene(lower, view, goal, clay_colours(view, goal), [], width=width)
-    lower.set_title("goal", fontsize=7, pad=1.5)
-
-
-def _make_view(task: Task, start: Array, goal: Array, tools: list[Array]) -> View:
-    clay = np.concatenate([start, goal])
-    low, high = clay.min(axis=0), clay.max(axis=0)
-    ground = task.scene.ground_height
-    x, z = (low[0] - 0.03, high[0] + 0.03), (low[2] - 0.03, high[2] + 0.03)
-    floor = np.array([[x[0], ground, z[0]], [x[1], ground, z[0]], [x[1], ground, z[1]], [x[0], ground, z[1]], [x[0], ground, z[0]]])
-    azimuth, elevation = DIRECTIONS.get(task.name, DIRECTION)
-    everything = np.concatenate([clay, floor, *(surface.reshape(-1, 3) for surface in tools)])
-    camera = fit_camera(everything, azimuth=azimuth, elevation=elevation, aspect=PANEL_ASPECT, margin=0.03)
-    return View(camera, particle_spacing(start), float(low[1]), float(high[1]), floor)
-
-
-def _save(canvas: Any, path: Path) -> None:
-    """Write a PNG file of 256 colours: a third of the size, and no difference to see."""
-    from PIL import Image
-
-    canvas.draw()
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-    picture.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 if __name__ == "__main__":

@@ -47,6 +47,16 @@ def test_a_loop_of_single_steps_has_the_gradient_of_one_rollout(simulator: Simul
         assert expected.abs().max() > 0.0, name
 
 
+def test_simulating_without_a_way_back_gives_the_numbers_of_a_rollout(simulator: Simulator) -> None:
+    start, plan = stirred(simulator, batch_size=2), actions_for(simulator, batch_size=2, steps=2)
+    whole, alone = simulator.rollout(start, plan), simulator.simulate(start, plan)
+    assert alone.checkpoints is None
+    assert torch.equal(alone.positions, whole.positions)
+    assert torch.equal(alone.tool_poses, whole.tool_poses)
+    for name in FIELDS:
+        assert torch.equal(getattr(alone.final_state, name), getattr(whole.final_state, name)), name
+
+
 def test_a_final_gradient_of_zeros_changes_nothing_and_another_shape_is_named(simulator: Simulator) -> None:
     trajectory = simulator.rollout(stirred(simulator, batch_size=2), actions_for(simulator, batch_size=2))
     weights = trajectory.positions.clone()

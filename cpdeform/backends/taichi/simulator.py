@@ -124,12 +124,19 @@ class SimulatorTaichi(SimulatorCheckpointing):
 
     def rollout(self, state: State, actions: Tensor) -> Trajectory:
         """Simulate T environment steps; see `Simulator.rollout`."""
+        return self._rollout(state, actions, memory_budget=self.memory_budget)
+
+    def simulate(self, state: State, actions: Tensor) -> Trajectory:
+        """Simulate T environment steps and keep nothing for `vjp`; see `Simulator.simulate`."""
+        return dataclasses.replace(self._rollout(state, actions, memory_budget=0), checkpoints=None)
+
+    def _rollout(self, state: State, actions: Tensor, *, memory_budget: int) -> Trajectory:
         self.check_inputs(state, actions)
         state, actions = state.map(self._own), self._own(actions)
         worlds, steps, tools = state.batch_size, actions.shape[1], state.tool_pose.shape[1]
         positions = torch.empty(worlds, steps + 1, state.particle_count, 3, dtype=self.dtype, device=self.device)
         positions[:, 0] = state.position
-        keep = worlds * self._history_bytes(steps) <= self.memory_budget
+        keep = worlds * self._history_bytes(steps) <= memory_budget
         with self._stream():
             stepper = Stepper(self._program, worlds=worlds, threads=self.threads)
             poses, particles = self._move_tools(state, actions), _records(state)

@@ -200,10 +200,17 @@ class SimulatorWarp(SimulatorCheckpointing):
 
     def rollout(self, state: State, actions: Tensor) -> Trajectory:
         """Simulate T environment steps; see `Simulator.rollout`."""
+        return self._rollout(state, actions, memory_budget=self.memory_budget)
+
+    def simulate(self, state: State, actions: Tensor) -> Trajectory:
+        """Simulate T environment steps and keep nothing for `vjp`; see `Simulator.simulate`."""
+        return dataclasses.replace(self._rollout(state, actions, memory_budget=0), checkpoints=None)
+
+    def _rollout(self, state: State, actions: Tensor, *, memory_budget: int) -> Trajectory:
         self.check_inputs(state, actions)
         state, actions = state.map(self._own), self._own(actions)
         worlds, steps = state.batch_size, actions.shape[1]
-        keep = worlds * self._history_bytes(steps, worlds) <= self.memory_budget
+        keep = worlds * self._history_bytes(steps, worlds) <= memory_budget
         if self._slots is None:
             return self._rollout_lanes(state, actions, keep)
         slots = self._slots

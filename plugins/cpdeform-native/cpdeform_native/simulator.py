@@ -87,6 +87,13 @@ class SimulatorNative(SimulatorCheckpointing):
 
     def rollout(self, state: State, actions: Tensor) -> Trajectory:
         """Simulate T environment steps; see `Simulator.rollout`."""
+        return self._rollout(state, actions, memory_budget=self.memory_budget)
+
+    def simulate(self, state: State, actions: Tensor) -> Trajectory:
+        """Simulate T environment steps and keep nothing for `vjp`; see `Simulator.simulate`."""
+        return dataclasses.replace(self._rollout(state, actions, memory_budget=0), checkpoints=None)
+
+    def _rollout(self, state: State, actions: Tensor, *, memory_budget: int) -> Trajectory:
         self.check_inputs(state, actions)
         state, actions = state.map(self._own), self._own(actions)
         worlds, steps, tools = state.batch_size, actions.shape[1], state.tool_pose.shape[1]
@@ -109,7 +116,7 @@ class SimulatorNative(SimulatorCheckpointing):
                 affine,
                 strain,
             ),
-            keep=self._keeps_substeps(steps, worlds),
+            keep=worlds * steps * self._step_bytes() <= memory_budget,
         )
         final = State(positions[:, -1].clone(), velocity, affine, strain, poses[:, -1].clone())
         return Trajectory(

@@ -32,3 +32,12 @@ def cpdeform_placers() -> list[PluginSpec]:
 @hookimpl
 def cpdeform_tasks() -> list[PluginSpec]:
     return [PluginSpec("toy", "cpdeform_toy:missing.yaml", "a task whose file is missing")]
+
+
+@hookimpl
+def cpdeform_commands() -> list[PluginSpec]:
+    return [
+        PluginSpec("toy-greet", "cpdeform_toy.commands:greet", "Greet somebody."),
+        PluginSpec("toy-lost", "cpdeform_toy.commands:lost", "Not there."),
+        PluginSpec("tasks", "cpdeform_toy.commands:greet", "Not the built-in one."),
+    ]

@@ -1,0 +1,105 @@
+"""Equal cost for every method: what a rollout without gradient costs, and how large a search may be for a budget."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cpdeform.core.plugins import Registry
+from cpdeform.core.reading.json_text import read_json
+from cpdeform.core.task import Task
+from cpdeform.run.configuration import RunConfiguration
+from cpdeform.run.record_files import write_json
+
+SHARES_FILE = "rollout-shares.json"
+"""What a rollout costs in each task: measured once, so that an experiment that goes on has the budgets that it began with."""
+
+POPULATION, SAMPLES, KEPT = 16, 32, 3
+"""Plans of a generation of `cma`, samples of a round of `mppi`, descents of `sampled-gradients`."""
+
+REPEATS = 5
+
+
+def rollout_share(task: Task, configuration: RunConfiguration, out: Path, *, registry: Registry) -> float:
+    """What a rollout without gradient costs in a task, in evaluations with gradient; measured unless it is known already.
+
+    Args:
+        task: With all changes of its scene.
+        configuration: Names the simulator.
+        out: Directory of the experiment, where the shares are kept.
+        registry: Where the simulator is looked up.
+    """
+    path, shares = out / SHARES_FILE, dict[str, float]()
+    with contextlib.suppress(OSError, ValueError):
+        shares = {name: float(share) for name, share in read_json(path, argument=str(path)).items()}
+    if task.name not in shares:
+        shares[task.name] = measured_share(task, configuration, registry=registry)
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(path, shares)
+    return shares[task.name]
+
+
+def measured_share(task: Task, configuration: RunConfiguration, *, registry: Registry) -> float:
+    """Time of a rollout that keeps nothing, over that of one with its gradient; one world, the quickest of several each."""
+    options = {**configuration.simulator_options, "batch_size": 1}
+    simulator = registry.create("simulator", configuration.backend, scene=task.scene, device=configuration.device, **options)
+    state, actions = simulator.initial_state(), torch.zeros(1, task.rollout_steps, task.scene.action_size)
+    actions = actions.to(state.position)
+    alone, whole = [], []
+    for _ in range(REPEATS + 1):
+        marks = [time.perf_counter()]
+        simulator.simulate(state, actions)
+        marks.append(time.perf_counter())
+        trajectory = simulator.rollout(state, actions)
+        simulator.vjp(trajectory, torch.ones_like(trajectory.positions))
+        marks.append(time.perf_counter())
+        alone.append(marks[1] - marks[0])
+        whole.append(marks[2] - marks[1])
+    # The first of each warms up.
+    return round(min(alone[1:]) / min(whole[1:]), 3)
+
+
+def budget_values(method: str, cost: float, *, share: float, iterations: int) -> dict[str, Any]:
+    """Values of a method's configuration with which a stage costs about as much as it may.
+
+    Args:
+        method: A name of `cpdeform.experiments.experiment_plan.METHODS`.
+        cost: What a stage may cost, in gradient evaluations.
+        share: What a rollout without gradient costs.
+        iterations: Gradient evaluations of a descent where the method makes several.
+
+    Returns:
+        Fields of `RunConfiguration`, nested; none for a method that has no such size.
+    """
+    whole = max(1, round(cost))
+    single = {"optimizer": {"iterations": whole, "patience": whole}}
+    descent = min(iterations, whole)
+    several = {"optimizer": {"iterations": descent, "patience": descent}}
+    rollouts = max(4, round(cost / share))
+    if method == "fixed":
+        return single
+    if method == "random":
+        return {**single, "placer_options": {"rounds": 1}}
+    if method == "restarts":
+        return {**several, "strategy_options": {"restarts": max(1, round(cost / descent))}}
+    if method == "bayesopt":
+        return {**several, "strategy_options": {"evaluations": max(1, round(cost / descent))}}
+    if method == "cma":
+        population = min(POPULATION, rollouts)
+        return {"strategy_options": {"population": population, "generations": max(1, round(rollouts / population))}}
+    if method == "mppi":
+        samples = min(SAMPLES, max(2, rollouts // 2))
+        return {"strategy_options": {"samples": samples, "updates": max(1, round(rollouts / samples) - 1)}}
+    if method == "sampled-gradients":
+        kept = min(KEPT, max(1, whole // 2))
+        descent = max(1, round(0.5 * cost / kept))
+        samples = max(kept, round(0.5 * cost / share))
+        return {
+            "optimizer": {"iterations": descent, "patience": descent, "pruner": "none"},
+            "strategy_options": {"samples": samples, "keep": kept},
+        }
+    return {}

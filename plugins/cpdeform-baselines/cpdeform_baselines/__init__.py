@@ -1,0 +1,1 @@
+"""Rivals of contact points discovery: searches over contact plans, and reinforcement learning."""

@@ -1,0 +1,1 @@
+"""Reinforcement learning on the tasks: stable-baselines3, and a first-order learner."""

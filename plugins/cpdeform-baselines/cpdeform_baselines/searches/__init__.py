@@ -1,0 +1,1 @@
+"""Searches over contact plans: strategies with their placers."""
