@@ -99,7 +99,7 @@ def new_task(request: Request) -> NewTask:
     relief = read_relief(request.goal) if picture else None
     goal = None if picture else _read(request.goal, request, notes)
     body = _board(relief, request) if relief is not None else _body(goal, request, notes)
-    scene = _scene(body, [])
+    scene = _scene(body, [], request.folder)
     if relief is not None:
         lower = np.subtract(body["position"], 0.5 * np.asarray(body["widths"]))
         points = fill_evenly(Relief(lower, np.asarray(body["widths"]), relief, DEPTH), request.particles)

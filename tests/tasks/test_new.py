@@ -63,7 +63,8 @@ def test_a_task_from_meshes_alone(meshes: Path) -> None:
 def test_a_block_and_two_tools_where_nothing_else_is_given(meshes: Path) -> None:
     task = new_task(Request(name="plain", goal=meshes / "ball.obj", folder=meshes, particles=COUNT)).task
     (body,) = task.scene.bodies
-    assert body.volume == pytest.approx(4.0 / 3.0 * np.pi * (0.5 * np.ptp(task.load_goal()[:, 0])) ** 3, rel=0.2)
+    # The outermost particles lie half a gap inside of the ball's surface.
+    assert body.volume == pytest.approx(4.0 / 3.0 * np.pi * (0.5 * np.ptp(task.load_goal()[:, 0])) ** 3, rel=0.3)
     assert [tool.kind for tool in task.scene.tools] == ["Box", "Box"]
     assert all(tool.movable for tool in task.scene.tools)
 
@@ -108,7 +109,8 @@ def test_thin_walls_and_narrow_hollows_are_told() -> None:
     scene = Scene.model_validate({"bodies": [body], "tools": [ball]})
     points = even_points(4000)
     block = 0.4 + 0.2 * points
-    sheet = np.array([0.3, 0.3, 0.3]) + points * [0.4, 0.012, 0.4]
+    line = np.linspace(0.3, 0.7, 60)
+    sheet = np.stack(np.meshgrid(line, [0.303, 0.309], line, indexing="ij"), axis=-1).reshape(-1, 3)
     slit = block[np.abs(block[:, 0] - 0.5) > 0.018]
     assert check_goal_detail(scene, block) == []
     (thin,) = check_goal_detail(scene, sheet)

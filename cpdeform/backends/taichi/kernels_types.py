@@ -77,6 +77,7 @@ def build_types(real: Any) -> SimpleNamespace:
         friction=real,
         action_offset=ti.i32,
         action_size=ti.i32,
+        grid_first=ti.i32,  # where its numbers begin in `values`
         scale=vec7,  # motion per substep at action 1: length, radians
         lower=vec3,
         upper=vec3,
