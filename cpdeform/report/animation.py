@@ -58,7 +58,9 @@ def draw_animation(record: RunRecord, *, camera: str | tuple[float, float] = "de
     pictures += [pictures[-1]] * round(HOLD_SECONDS * rate)
     path = record.directory / f"animation.{form}"
     options: dict[str, Any] = (
-        {"fps": rate, "codec": "libx264", "quality": 8} if form == "mp4" else {"duration": 1000.0 / rate, "loop": 0}
+        {"fps": rate, "codec": "libx264", "quality": 8, "macro_block_size": 4}
+        if form == "mp4"
+        else {"duration": 1000.0 / rate, "loop": 0}
     )
     with replacing(path) as temporary:
         writer: Any = imageio.v2.get_writer(str(temporary), format="FFMPEG" if form == "mp4" else "GIF", mode="I", **options)
