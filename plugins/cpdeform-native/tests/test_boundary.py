@@ -48,7 +48,7 @@ def test_a_scene_that_kernels_cannot_take_is_refused(name: str, value: Any) -> N
         ("action_size", 100, "action_size"),
         ("action_size", -1, "action_size"),
         ("action_size", 7, "action_size"),
-        ("kind", 7, "kind"),
+        ("kind", 8, "kind"),
         ("kind", -1, "kind"),
         ("size", (), "size"),
         ("size", (-0.1, 0.0, 0.0, 0.0), "size"),
