@@ -11,7 +11,7 @@ from backend_cases import BACKENDS, CASES, actions_for, backend_class, stirred
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.simulator import Simulator, differentiable_rollout
-from cpdeform.planning.chain import CLEARANCE, SimulatorChain, moved_out
+from cpdeform.planning.chain import CLEARANCE, SimulatorChain, begin_stage, moved_out
 
 STEPS = 2
 
@@ -46,7 +46,9 @@ def test_a_chain_is_its_stages_one_after_the_other_and_so_is_its_gradient(simula
     weights = torch.linspace(-1.0, 1.0, whole.positions.numel(), dtype=torch.float64).view_as(whole.positions)
     total = torch.zeros((), dtype=torch.float64)
     for number, some in enumerate(actions.split(STEPS, dim=1)):
-        placed = state.with_tools(chain.begin(state.map(torch.Tensor.detach), poses[number], some.detach()).tool_pose)
+        placed = state.with_tools(
+            begin_stage(simulator.scene, state.map(torch.Tensor.detach), poses[number], some.detach()).tool_pose
+        )
         stage = differentiable_rollout(simulator, placed, some)
         window = slice(number * STEPS, (number + 1) * STEPS + number)
         counted = stage.positions if number else stage.positions[:, :-1]

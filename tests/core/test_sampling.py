@@ -78,4 +78,5 @@ def test_particles_of_plasticinelab(name):
         recorded = recording["x0"]
     task = load_task(TASKS_BY_RECORDING.get(name, name))
     scene = task.scene.model_copy(update={"sampling": "plasticinelab"})
-    np.testing.assert_array_equal(sample_particles(scene), recorded)
+    # The last digit of a sine depends on the processor.
+    np.testing.assert_allclose(sample_particles(scene), recorded, rtol=0.0, atol=1e-15)

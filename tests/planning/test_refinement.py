@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 import torch
 from cpdeform_toy.parts import OTSolverToy, PlacerToy
@@ -136,7 +138,8 @@ def test_progress_tells_the_phase_and_the_bar_stays(task, monkeypatch, capsys):
     monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
     bar = progress.ProgressBar(stages=1)
     run(task, goal(task), observers=(progress.ProgressLines(), bar))
-    assert f"stage 1, refinement {ITERATIONS}/{ITERATIONS}, loss" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert re.search(rf"stage 1,( batch \d+,)? refinement {ITERATIONS}/{ITERATIONS}, loss", err)
     (shown,) = bar._progress.tasks
     assert (shown.completed, shown.total) == (2, 2)
     assert shown.description.startswith("stage 1 refinement")

@@ -288,7 +288,10 @@ def test_the_tasks_that_come_with_it_have_no_fault(name: str) -> None:
         notes = check_task(task)
         assert [finding for finding in notes if finding.severity != "note"] == []
         kinds = {"move": {"goal floating"}, "triple-move": {"goal floating"}, "table": {"near bodies"}}
-        assert {finding.kind for finding in notes} == kinds.get(name, set())
+        found = {finding.kind for finding in notes}
+        assert found - {"goal detail"} == kinds.get(name, set())
+        # Some of the paper's goals are thin: ends of ropes, legs of a table.
+        assert "goal detail" not in found or name in {"chopsticks", "rope", "rope++", "table"}
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             warn_about_tools(task.scene)
