@@ -12,7 +12,6 @@ from cpdeform.core.signed_distance import signed_distance
 from cpdeform.testing import check_placer
 from cpdeform.testing.placer import PEAK, PLACER_CHECKS
 
-
 PLUGIN_PLACERS = {"bayesopt", "cma", "mppi", "samples"}
 """Those of cpdeform-baselines: they draw and fit for minutes, and their plugin has tests of its own."""
 
