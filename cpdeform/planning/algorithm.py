@@ -180,7 +180,7 @@ class Planner:
         try:
             candidates = self._search(bench)
             for phase in self._phases("search"):
-                self._tell_part(index, phase.name)
+                self.tell_part(index, phase.name)
                 candidates = phase.run(bench, candidates)
                 bench.lap(phase.name)
             return self._plan(bench, candidates, execution)
@@ -196,12 +196,12 @@ class Planner:
         best = min(range(len(candidates)), key=lambda number: candidates[number].loss, default=None)
         status = _search_status(candidates, best, bench.stage.loss)
         if best is not None and status is Status.FINISHED:
-            self._tell_part(bench.stage.index, "execution")
+            self.tell_part(bench.stage.index, "execution")
             status = self._execute(bench, self._phases("round", "search")[-1], candidates[best], execution)
         bench.lap("execution")
         if best is not None and status is Status.FINISHED:
             for phase in self._phases("plan"):
-                self._tell_part(bench.stage.index, phase.name)
+                self.tell_part(bench.stage.index, phase.name)
                 for changed in phase.run(bench, [candidates[best]]):
                     self._execute(bench, phase, changed, execution)
                 bench.lap(phase.name)
@@ -260,10 +260,10 @@ class Planner:
             simulator=self.simulator,
             objective=self.objective,
             executor=self.executor,
-            on_iteration=lambda iteration: self._tell_iteration(index, iteration),
-            on_batch=lambda worlds, memory: self._tell_batch(index, worlds, memory),
+            on_iteration=lambda iteration: self.tell_iteration(index, iteration),
+            on_batch=lambda worlds, memory: self.tell_batch(index, worlds, memory),
         )
-        self._tell_part(index, "transport")
+        self.tell_part(index, "transport")
         begin = self.objective.evaluate(still_trajectory(state, self.task.rollout_steps, scene=self.task.scene), warm)
         # "priorities f = optimal-transport potentials between current shape S_i and goal G"
         wanted = self.placer.transport_problem is not None
@@ -276,7 +276,7 @@ class Planner:
         """All candidates of a stage, round by round."""
         while True:
             # "p = particle with the largest priority; place the tools around p: best score, no collision with the body"
-            self._tell_part(bench.stage.index, "placement")
+            self.tell_part(bench.stage.index, "placement")
             proposals = self.placer.ask(bench.stage)
             bench.lap("placement")
             if not proposals:
@@ -284,7 +284,7 @@ class Planner:
             # "for each candidate pose in T: actions, loss = minimise the shape loss through the simulator"
             found = [Candidate(proposal, float("nan"), proposal.pose.new_empty(0)) for proposal in proposals]
             for phase in self._phases("round"):
-                self._tell_part(bench.stage.index, phase.name)
+                self.tell_part(bench.stage.index, phase.name)
                 found = phase.run(bench, found)
             bench.keep(found)
             bench.lap("optimization")
@@ -307,15 +307,18 @@ class Planner:
     def _phases(self, *scopes: str) -> list[Phase]:
         return [phase for phase in self.phases if phase.scope in scopes]
 
-    def _tell_part(self, index: int, part: str) -> None:
+    def tell_part(self, index: int, part: str) -> None:
+        """Tell the observers of a part of a stage; see `Observer.part_started`."""
         for observer in self.observers:
             observer.part_started(index, part)
 
-    def _tell_iteration(self, index: int, iteration: Iteration) -> None:
+    def tell_iteration(self, index: int, iteration: Iteration) -> None:
+        """Tell the observers of an iteration; see `Observer.iteration_finished`."""
         for observer in self.observers:
             observer.iteration_finished(index, iteration)
 
-    def _tell_batch(self, index: int, worlds: int, memory: int) -> None:
+    def tell_batch(self, index: int, worlds: int, memory: int) -> None:
+        """Tell the observers of a batch of worlds; see `Observer.optimization_started`."""
         for observer in self.observers:
             observer.optimization_started(index, worlds, memory)
 

@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from cpdeform.core.clearance import depth, way_out
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.final_gradient import takes_final_gradient
 from cpdeform.core.scene import Scene, Tool
 from cpdeform.core.shapes.kinds import TOOLS
-from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.simulator import RolloutGradient, Simulator, SimulatorCapabilities, Trajectory
 from cpdeform.core.state import State
-
-CLEARANCE = 5e-4
-"""Distance from the clay at which the tools of a stage begin, length units."""
 
 FARTHEST = 0.1
 """How far a tool is moved out of the clay at most, length units."""
 
-LEAST_STEP = 5e-4
-"""The least a tool is moved at a time, length units."""
+ROUNDING = 1e-6
+"""How much nearer than its clearance a tool may begin, length units: one that was moved out is not moved again."""
 
 
 class SimulatorChain(Simulator):
@@ -110,6 +108,10 @@ class SimulatorChain(Simulator):
         each = step_count // len(self._poses)
         return len(self._poses) * self._simulator.memory_estimate(each, worlds=worlds)
 
+    def release_memory(self) -> None:
+        """See `Simulator`."""
+        self._simulator.release_memory()
+
     def _split(self, actions: Tensor) -> tuple[Tensor, ...]:
         if actions.shape[1] % len(self._poses):
             raise InputError(
@@ -153,14 +155,14 @@ def moved_out(tool: Tool, pose: Tensor, motion: Tensor, particles: Tensor) -> Te
     direction = torch.nn.functional.pad(-motion.detach(), (0, 3 - len(motion)))
     length = float(torch.linalg.vector_norm(direction))
     direction = direction / length if length > 0.0 else direction.new_tensor([0.0, 1.0, 0.0])
-    found, gone = pose.clone(), 0.0
-    while (gap := float(signed_distance(tool, found, particles).min()) - CLEARANCE) < 0.0:
-        gone += max(-gap, LEAST_STEP)
-        if gone > FARTHEST:
-            return pose
-        found[:3] = pose[:3] + gone * direction
+    if depth(tool, pose, particles) <= ROUNDING:
+        return pose
+    gone = way_out(tool, pose, direction, particles, farthest=FARTHEST)
+    if not math.isfinite(gone):
+        return pose
+    found = pose.clone()
     lower, upper = pose.new_tensor(tool.lower_bound), pose.new_tensor(tool.upper_bound)
-    found[:3] = torch.minimum(torch.maximum(found[:3], lower), upper)
+    found[:3] = torch.minimum(torch.maximum(pose[:3] + gone * direction, lower), upper)
     return found
 
 

@@ -42,6 +42,18 @@ class StageInterrupted(KeyboardInterrupt):
         self.result = result
 
 
+class StagesInterrupted(KeyboardInterrupt):
+    """An interruption while several stages were polished together; its cause is the interruption itself.
+
+    Args:
+        results: The stages with their best plans so far executed.
+    """
+
+    def __init__(self, results: Sequence[StageResult]) -> None:
+        super().__init__(f"interrupted in stages {results[0].index} to {results[-1].index}")
+        self.results = tuple(results)
+
+
 def best_so_far(
     bench: Workbench,
     phases: Sequence[Phase],

@@ -7,24 +7,23 @@ import time
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from cpdeform.core.memory_limit import check_memory
 from cpdeform.core.placer import Candidate
 from cpdeform.core.state import State
 from cpdeform.planning.algorithm import Planner
 from cpdeform.planning.chain import SimulatorChain, begin_stage
-from cpdeform.planning.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
+from cpdeform.planning.interrupted import StagesInterrupted
+from cpdeform.planning.optimizer import Iteration, TrajectoryOptimizer
+from cpdeform.planning.race import Race
 from cpdeform.planning.result import StageResult
 from cpdeform.planning.workbench import is_finite
 
 PHASE = "joint polish"
 
 
-def polish_jointly(
-    planner: Planner,
-    results: Sequence[StageResult],
-    optimizer: TrajectoryOptimizer,
-) -> list[StageResult]:
+def polish_jointly(planner: Planner, results: Sequence[StageResult], optimizer: TrajectoryOptimizer) -> list[StageResult]:
     """Lower the loss at the end of several stages over the actions of all of them, and execute them anew.
 
     A stage that is planned alone is done when its own loss is low. Together they can prepare each other: the first one may leave
@@ -37,48 +36,82 @@ def polish_jointly(
 
     Returns:
         The stages with their new plans; those given where nothing is gained.
+
+    Raises:
+        CapabilityError: The simulator's gradients cannot be chained.
+        InputError: There is not enough memory.
+        StagesInterrupted: A `KeyboardInterrupt` came; it holds the stages with the best plans so far.
     """
     planned = [result for result in results if result.actions is not None]
     if not planned:
         return list(results)
     begun = time.perf_counter()
-    actions = torch.cat([result.actions for result in planned if result.actions is not None]).unsqueeze(0)
-    found = _minimize(planner, planned, actions, optimizer)
-    executed = _execute(planner, planned, found)
+    found = _minimize(planner, planned, optimizer)
+    executed = _execute(planner, planned, found.actions)
     if executed is None or not executed[-1].loss < planned[-1].loss:
         executed = planned
     seconds = (time.perf_counter() - begun) / len(planned)
     polished = iter([_accounted(result, seconds, found, last=result is executed[-1]) for result in executed])
-    return [result if result.actions is None else next(polished) for result in results]
+    final = [result if result.actions is None else next(polished) for result in results]
+    if found.interruption is not None:
+        raise StagesInterrupted(final) from found.interruption
+    return final
 
 
-def _minimize(
-    planner: Planner, planned: Sequence[StageResult], actions: torch.Tensor, optimizer: TrajectoryOptimizer
-) -> OptimizationResult:
+@dataclasses.dataclass(frozen=True)
+class _Descent:
+    """What a descent came to, if only up to an interruption.
+
+    Attributes:
+        actions: Best actions (K T, A) of K stages, one after the other.
+        gradients: Gradients of each stage.
+        history: Its iterations.
+        interruption: What broke it off; None for nothing.
+    """
+
+    actions: Tensor
+    gradients: int
+    history: tuple[Iteration, ...]
+    interruption: KeyboardInterrupt | None = None
+
+
+def _minimize(planner: Planner, planned: Sequence[StageResult], optimizer: TrajectoryOptimizer) -> _Descent:
     """The descent, told to the observers as iterations of the last stage."""
     poses = torch.stack([_executed(result).proposal.pose for result in planned])
+    actions = torch.cat([result.actions for result in planned if result.actions is not None])
     chain = SimulatorChain(planner.simulator, poses=poses, rest_steps=planner.task.rest_steps)
-    check_memory(chain, step_count=actions.shape[1], worlds=1)
+    check_memory(chain, step_count=len(actions), worlds=1)
+    last, history, races = planned[-1], list[Iteration](), list[Race]()
 
-    def tell(iteration: Iteration) -> None:
-        for observer in planner.observers:
-            observer.iteration_finished(planned[-1].index, dataclasses.replace(iteration, phase=PHASE))
+    def note(iteration: Iteration) -> None:
+        history.append(dataclasses.replace(iteration, phase=PHASE))
+        planner.tell_iteration(last.index, history[-1])
 
-    return optimizer.minimize(
-        chain,
-        planned[0].state_before,
-        actions,
-        planner.objective,
-        warm=planned[-1].warm,
-        executor=planner.executor,
-        on_iteration=tell,
-    )
+    planner.tell_part(last.index, PHASE)
+    planner.tell_batch(last.index, 1, chain.memory_estimate(len(actions), worlds=1))
+    interruption = None
+    try:
+        optimizer.minimize(
+            chain,
+            planned[0].state_before,
+            actions.unsqueeze(0),
+            planner.objective,
+            warm=last.warm,
+            executor=planner.executor,
+            on_iteration=note,
+            on_start=races.append,
+        )
+    except KeyboardInterrupt as came:
+        if not races:
+            raise
+        interruption = came
+    return _Descent(races[0].best_actions[0], races[0].evaluations, tuple(history), interruption)
 
 
-def _execute(planner: Planner, planned: Sequence[StageResult], found: OptimizationResult) -> list[StageResult] | None:
-    """Each stage executed with its new actions; None where one leaves the finite numbers."""
+def _execute(planner: Planner, planned: Sequence[StageResult], plan: Tensor) -> list[StageResult] | None:
+    """Each stage executed with its new actions out of (K T, A); None where one leaves the finite numbers."""
     state, loss, executed = planned[0].state_before, planned[0].loss_before, list[StageResult]()
-    for result, actions in zip(planned, found.actions[0].chunk(len(planned)), strict=True):
+    for result, actions in zip(planned, plan.chunk(len(planned)), strict=True):
         before = state
         start = begin_stage(planner.task.scene, state, _executed(result).proposal.pose, actions.unsqueeze(0))
         trajectory = planner.simulator.rollout(start, actions.unsqueeze(0))
@@ -104,7 +137,7 @@ def _execute(planner: Planner, planned: Sequence[StageResult], found: Optimizati
     return executed
 
 
-def _with_plan(result: StageResult, start: State, actions: torch.Tensor, loss: float) -> tuple[Candidate, ...]:
+def _with_plan(result: StageResult, start: State, actions: Tensor, loss: float) -> tuple[Candidate, ...]:
     """The candidates of a stage, the executed one with its new plan."""
     proposal = dataclasses.replace(_executed(result).proposal, pose=start.tool_pose[0])
     changed = dataclasses.replace(_executed(result), proposal=proposal, actions=actions, loss=loss)
@@ -117,12 +150,11 @@ def _executed(result: StageResult) -> Candidate:
     return result.candidates[result.best]
 
 
-def _accounted(result: StageResult, seconds: float, found: OptimizationResult, *, last: bool) -> StageResult:
+def _accounted(result: StageResult, seconds: float, found: _Descent, *, last: bool) -> StageResult:
     """A stage with its share of what the joint polish took; the last stage keeps its iterations."""
-    iterations = [dataclasses.replace(iteration, phase=PHASE) for iteration in found.history] if last else []
     return dataclasses.replace(
         result,
-        gradient_evaluations=result.gradient_evaluations + found.gradient_evaluations,
-        history=(*result.history, *iterations),
+        gradient_evaluations=result.gradient_evaluations + found.gradients,
+        history=(*result.history, *(found.history if last else ())),
         seconds={**result.seconds, PHASE: seconds, "total": result.seconds.get("total", 0.0) + seconds},
     )

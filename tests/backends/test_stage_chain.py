@@ -8,10 +8,11 @@ import pytest
 import torch
 from backend_cases import BACKENDS, CASES, actions_for, backend_class, stirred
 
+from cpdeform.core.clearance import CLEARANCE
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.simulator import Simulator, differentiable_rollout
-from cpdeform.planning.chain import CLEARANCE, SimulatorChain, begin_stage, moved_out
+from cpdeform.planning.chain import SimulatorChain, begin_stage, moved_out
 
 STEPS = 2
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from cpdeform.core.clearance import CLEARANCE, LEAST_STEP
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate, Stage
 from cpdeform.core.rotation import rotate
@@ -16,7 +17,7 @@ from cpdeform.placement.tool import tool_half_extents
 from cpdeform.placement.touches.pinch import TouchPinch
 from cpdeform.placement.touches.placer import PlacerTouch, place
 from cpdeform.placement.touches.push import TouchPress, TouchPush
-from cpdeform.placement.touches.touch import CLEARANCE, LEAST_STEP, Room, facing
+from cpdeform.placement.touches.touch import Room, facing
 from cpdeform.testing.placer import transport_of
 
 BLADE = {

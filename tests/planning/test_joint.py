@@ -13,6 +13,7 @@ from cpdeform.core.objective import ObjectiveAutograd
 from cpdeform.core.simulator import RolloutGradient
 from cpdeform.core.task import load_task
 from cpdeform.planning.algorithm import Planner
+from cpdeform.planning.chain import SimulatorChain
 from cpdeform.planning.joint import PHASE, polish_jointly
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.descent import PhaseDescent
@@ -135,9 +136,25 @@ def test_the_strategy_polishes_two_stages_at_a_time(task):
     assert not any(PHASE in stage.seconds for stage in alone.stages)
 
 
-def test_an_interruption_keeps_the_stages_that_were_found(task):
+def test_an_interruption_keeps_the_best_plans_so_far(task):
     watch = Interrupt()
     with pytest.raises(KeyboardInterrupt):
         sculpted(task, observers=(watch,))
     assert [result.index for result in watch.told] == [0, 1]
     assert all(result.status is Status.FINISHED for result in watch.told)
+    # What was computed until then counts, and its gain is executed.
+    tried = [iteration for iteration in watch.told[-1].history if iteration.phase == PHASE]
+    assert len(tried) == 2
+    assert watch.told[-1].loss <= float(tried[0].loss[0])
+
+
+def test_memory_of_the_chain_is_given_back_by_its_simulator(task):
+    class Keeping(SimulatorChained):
+        released = 0
+
+        def release_memory(self):
+            self.released += 1
+
+    simulator = Keeping(task.scene)
+    SimulatorChain(simulator, poses=simulator.initial_state().tool_pose).release_memory()
+    assert simulator.released == 1

@@ -11,25 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cpdeform.core.rotation import multiply, rotate, rotate_inverse
+from cpdeform.core.clearance import depth, way_out
+from cpdeform.core.rotation import multiply, rotate
 from cpdeform.core.scene import Scene, Tool
-from cpdeform.core.signed_distance import local_distance, signed_distance
+from cpdeform.core.signed_distance import signed_distance
 from cpdeform.placement.tool import tool_half_extents
 
-CLEARANCE = 5e-4
-"""Distance from the clay at which a tool begins, length units."""
-
 LEAST_DEPTH = 1e-3
-"""How deep a tool at the contact point has to reach into the clay, length units: otherwise it would pass it by."""
+"""How deep a tool at the contact point has to reach into the clay, length units."""
 
 REACH = 0.4
 """How far behind a contact point a tool is looked for, length units."""
-
-LEAST_STEP = 2e-3
-"""The least a tool is moved at a time on its way out, length units."""
-
-BISECTIONS = 4
-"""Halvings of the last step."""
 
 BETWEEN_TOOLS = 1e-3
 """Least distance between tools, length units."""
@@ -93,42 +85,16 @@ class Room:
         low = self.floor + float(tool_half_extents(tool, rotation)[1])
         start = contact.clone()
         start[1] = max(float(start[1]), low)
-        length = self._way_out(tool, rotation, start, -direction)
+        inside = torch.cat([start, rotation, self.poses[index, 7:]])
+        # A tool that hardly reaches the clay here would pass it by.
+        pressing = depth(tool, inside, self.particles) >= LEAST_DEPTH
+        length = way_out(tool, inside, -direction, self.particles, farthest=REACH) if pressing else math.inf
         position = start - length * direction
         lower, upper = position.new_tensor(tool.lower_bound), position.new_tensor(tool.upper_bound)
-        inside = math.isfinite(length) and bool(((position >= lower) & (position <= upper)).all())
-        if not inside or float(position[1]) < low - 1e-6:
+        within = math.isfinite(length) and bool(((position >= lower) & (position <= upper)).all())
+        if not within or float(position[1]) < low - 1e-6:
             return None
         return torch.cat([position, rotation, self.poses[index, 7:]])
-
-    def _way_out(self, tool: Tool, rotation: Tensor, start: Tensor, direction: Tensor) -> float:
-        """How far a tool at `start` (3,) has to move along `direction` (3,) to be free of the clay; infinity if it does not press.
-
-        A tool that reaches a depth into the clay is not free before it has moved by that depth.
-        """
-        # In the tool's frame, the clay that it can meet on its way lies in a tube.
-        points, way = rotate_inverse(rotation, self.particles - start), rotate_inverse(rotation, direction)
-        radius = float(torch.linalg.vector_norm(tool_half_extents(tool, rotation))) + CLEARANCE
-        points = points[torch.linalg.vector_norm(points - (points @ way)[:, None] * way, dim=-1) <= radius]
-        if not len(points):
-            return math.inf
-
-        def gap(length: float) -> float:
-            return float(local_distance(tool, *(points - length * way).unbind(-1)).min()) - CLEARANCE
-
-        length, found = 0.0, gap(0.0)
-        if found > -LEAST_DEPTH:
-            return math.inf
-        while found < 0.0:
-            step = max(-found, LEAST_STEP)
-            length += step
-            if length > REACH:
-                return math.inf
-            found = gap(length)
-        for _ in range(BISECTIONS):
-            step *= 0.5
-            length = length - step if gap(length - step) >= 0.0 else length
-        return length
 
     def apart(self, moves: dict[int, Move]) -> bool:
         """Whether the tools of a touch are free of each other and of the other tools."""

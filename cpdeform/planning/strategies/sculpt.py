@@ -14,7 +14,7 @@ from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
 from cpdeform.planning.coarse import CoarseModel
-from cpdeform.planning.interrupted import StageInterrupted
+from cpdeform.planning.interrupted import StageInterrupted, StagesInterrupted
 from cpdeform.planning.joint import polish_jointly
 from cpdeform.planning.objectives.shape import ObjectiveShape
 from cpdeform.planning.optimizer import TrajectoryOptimizer
@@ -121,7 +121,7 @@ class StrategySculpt(Strategy):
                 if takes_final_gradient(planner.simulator):
                     found = polish_jointly(planner, found, self._joint)
             except KeyboardInterrupt as interruption:
-                yield from found
+                yield from interruption.results if isinstance(interruption, StagesInterrupted) else found
                 if isinstance(interruption, StageInterrupted):
                     yield interruption.result
                 raise
