@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import re
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,15 @@ from typing import Any
 from cpdeform.core.errors import CpdeformError, RecordError
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.task import Task
-from cpdeform.experiments.experiment_plan import BASELINE, REFERENCE, ExperimentSettings, PlannedRun, configure, record_directory
+from cpdeform.experiments.experiment_plan import (
+    BASELINE,
+    REFERENCE,
+    ExperimentSettings,
+    PlannedRun,
+    configure,
+    plain_name,
+    record_directory,
+)
 from cpdeform.experiments.experiment_row import OVER, ExperimentRow, forget, forget_failure, note_failure, read_row
 from cpdeform.experiments.studies.equal_cost import budget_values, rollout_share
 from cpdeform.run.configuration import RunConfiguration
@@ -142,9 +148,8 @@ def _plain(content: Any) -> dict[str, Any]:
 
 
 def _name(task: str, method: str, seed: int) -> str:
-    """Name of a run's job; a task's name may hold what a file's cannot."""
-    plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", task).lstrip(".+-")
-    return f"{plain if plain == task else f'{plain}-{zlib.crc32(task.encode()):08x}'}-{method}-seed{seed}"
+    """Name of a run's job."""
+    return f"{plain_name(task)}-{method}-seed{seed}"
 
 
 def evaluations_per_stage(row: ExperimentRow | None) -> int | None:

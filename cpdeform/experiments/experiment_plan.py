@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -254,3 +255,9 @@ def _goal(goals: Path, task: str) -> Path:
         remedy = "Make it with `cpdeform task import-grid`, or leave --goals out."
         raise InputError(f"--goals: goal of {task}", came=f"no file {path.name}", expected="one for every task", remedy=remedy)
     return path
+
+
+def plain_name(task: str) -> str:
+    """The name of a task as a part of a file's name: it may hold what that cannot."""
+    plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", task).lstrip(".+-")
+    return plain if plain == task else f"{plain}-{zlib.crc32(task.encode()):08x}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,14 @@ from toy_fixtures import write_toy_distribution, write_toy_task
 from typer.testing import CliRunner
 
 from cpdeform.cli.main import app
-from cpdeform.experiments.studies.equal_cost import budget_values
+from cpdeform.core.plugins import load_registry
+from cpdeform.core.task import load_task
+from cpdeform.experiments.studies import equal_cost
+from cpdeform.experiments.studies.equal_cost import budget_values, known_shares, rollout_share
 from cpdeform.experiments.studies.statistics import Interval, mean, rank_correlation
 from cpdeform.experiments.studies.study import PRESETS, STUDIES
 from cpdeform.experiments.studies.trace import learning_curve, stage_points, value_at
+from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record import load_record
 
 PARTS = ["--tasks", "shift.yaml", "--backend", "toy", "--ot", "toy"]
@@ -156,7 +161,24 @@ def test_rivals_spend_what_the_reference_spent(folder):
     spent = {name: float(line["cost"]) for name, line in lines.items()}
     assert spent["fixed"] == pytest.approx(spent["cpdeform"], rel=0.5)
     assert "`cpdeform` is first on" in Path("out/summary.md").read_text()
-    assert Path("out/rollout-shares.json").is_file()
+    assert known_shares(Path("out"))["shift"] > 0.0
+
+
+def test_of_workers_that_measure_at_once_the_first_one_counts(folder, monkeypatch):
+    """A share that another worker wrote while this one measured is taken instead of the own one."""
+    task, out = load_task("shift.yaml"), Path("together")
+    shares = iter([0.25, 0.5])
+
+    def measured(task, configuration, *, registry):
+        own = next(shares)
+        if own == 0.25:
+            assert rollout_share(task, configuration, out, registry=registry) == 0.5
+        return own
+
+    monkeypatch.setattr(equal_cost, "measured_share", measured)
+    assert rollout_share(task, RunConfiguration(), out, registry=load_registry()) == 0.5
+    assert known_shares(out) == {"shift": 0.5}
+    assert [path.name for path in (out / "rollout-shares").iterdir()] == ["shift.json"]
 
 
 def test_an_interrupted_study_gives_the_table_of_an_uninterrupted_one(folder, monkeypatch):
@@ -164,8 +186,7 @@ def test_an_interrupted_study_gives_the_table_of_an_uninterrupted_one(folder, mo
 
     runs = [*PARTS, "--methods", "cpdeform,fixed", "--iterations", "3", "--seeds", "0,1", "--stages", "1"]
     assert experiment("rivals", *runs, "--out", "whole").exit_code == 0
-    Path("broken").mkdir()
-    Path("broken/rollout-shares.json").write_text(Path("whole/rollout-shares.json").read_text())
+    shutil.copytree("whole/rollout-shares", "broken/rollout-shares")
     rollout, calls = SimulatorToy.rollout, []
     stops = {5, 13}
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import time
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +14,12 @@ import torch
 from cpdeform.core.plugins import Registry
 from cpdeform.core.reading.json_text import read_json
 from cpdeform.core.task import Task
+from cpdeform.experiments.experiment_plan import plain_name
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record_files import write_json
 
-SHARES_FILE = "rollout-shares.json"
-"""What a rollout costs in each task: measured once, so that an experiment that goes on has the budgets that it began with."""
+SHARES = "rollout-shares"
+"""Directory of what a rollout costs in each task: measured once, so that an experiment that goes on has its first budgets."""
 
 POPULATION, SAMPLES, KEPT = 16, 32, 3
 """Plans of a generation of `cma`, samples of a round of `mppi`, descents of `sampled-gradients`."""
@@ -27,20 +30,41 @@ REPEATS = 5
 def rollout_share(task: Task, configuration: RunConfiguration, out: Path, *, registry: Registry) -> float:
     """What a rollout without gradient costs in a task, in evaluations with gradient; measured unless it is known already.
 
+    Of several workers that measure at once, the first one's figure counts for all: methods are compared by one budget.
+
     Args:
         task: With all changes of its scene.
         configuration: Names the simulator.
         out: Directory of the experiment, where the shares are kept.
         registry: Where the simulator is looked up.
+
+    Raises:
+        InputError: The file of an earlier share cannot be read.
     """
-    path, shares = out / SHARES_FILE, dict[str, float]()
-    with contextlib.suppress(OSError, ValueError):
-        shares = {name: float(share) for name, share in read_json(path, argument=str(path)).items()}
-    if task.name not in shares:
-        shares[task.name] = measured_share(task, configuration, registry=registry)
-        out.mkdir(parents=True, exist_ok=True)
-        write_json(path, shares)
-    return shares[task.name]
+    path = out / SHARES / f"{plain_name(task.name)}.json"
+    if not path.exists():
+        share = measured_share(task, configuration, registry=registry)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        own = path.with_name(f".{uuid.uuid4().hex}.json")
+        write_json(own, {"task": task.name, "share": share})
+        # A link, unlike a replacement, fails where another worker was first.
+        with contextlib.suppress(FileExistsError):
+            os.link(own, path)
+        own.unlink()
+    return float(read_json(path, argument=str(path))["share"])
+
+
+def known_shares(out: Path) -> dict[str, float]:
+    """The shares that an experiment has measured, by task.
+
+    Args:
+        out: Directory of the experiment.
+
+    Raises:
+        InputError: A file cannot be read.
+    """
+    found = [read_json(path, argument=str(path)) for path in sorted((out / SHARES).glob("[!.]*.json"))]
+    return {str(content["task"]): float(content["share"]) for content in found}
 
 
 def measured_share(task: Task, configuration: RunConfiguration, *, registry: Registry) -> float:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from cpdeform.core.reading.json_text import read_json
 from cpdeform.experiments.experiment_row import ExperimentRow
 from cpdeform.experiments.studies import ablation, rivals, runtime, search
-from cpdeform.experiments.studies.equal_cost import SHARES_FILE
+from cpdeform.experiments.studies.equal_cost import known_shares
 from cpdeform.experiments.studies.runs import StudyRun, study_runs
 from cpdeform.experiments.studies.study import ABLATION, RIVALS, RUNTIME, STUDIES
 from cpdeform.experiments.studies.summary import Summary, write_summary
@@ -36,8 +34,5 @@ def _summary(name: str, runs: Sequence[StudyRun], out: Path) -> Summary:
     if name == RUNTIME:
         return runtime.summarize(runs)
     if name == RIVALS:
-        shares: dict[str, float] = {}
-        with contextlib.suppress(OSError, ValueError):
-            shares = read_json(out / SHARES_FILE, argument=str(out / SHARES_FILE))
-        return rivals.summarize(runs, shares)
+        return rivals.summarize(runs, known_shares(out))
     return search.summarize(runs)
