@@ -8,13 +8,13 @@ import torch
 from toy_cone import SceneWithCones, ToolCone
 
 from cpdeform.backends.scene_numbers import tool_numbers
+from cpdeform.core.clearance import tool_half_extents
 from cpdeform.core.errors import CapabilityError, InputError, MissingExtraError
 from cpdeform.core.placer import Stage
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.scene import Scene
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
-from cpdeform.placement.tool import tool_half_extents
 from cpdeform.placement.transport import PlacerTransport
 from cpdeform.report.render import fit_camera, render
 from cpdeform.report.shapes import tool_surface

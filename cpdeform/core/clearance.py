@@ -1,74 +1,146 @@
-"""How far a tool has to move to be free of the clay."""
+"""How near tools are to the clay, and how far one has to move to be free of it."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from cpdeform.core.rotation import rotate_inverse
+from cpdeform.core.rotation import rotate, rotate_inverse
 from cpdeform.core.scene import Tool
 from cpdeform.core.shapes.tool import shape_of
-from cpdeform.core.signed_distance import local_distance, signed_distance
 
 CLEARANCE = 5e-4
-"""Distance from the clay at which a tool begins a stage, length units."""
+"""Distance from the clay at which a tool begins a touch, length units."""
 
-LEAST_STEP = 2e-3
+CHUNK_DISTANCES = 2**18
+"""Distances computed at once: small enough for the temporaries to stay in a processor's cache."""
+
+SMALLEST_STEP = 1e-3
 """The least a tool is moved at a time on its way out, length units."""
 
-BISECTIONS = 4
-"""Halvings of the last step."""
+MOST_STEPS = 64
+"""Steps after which a tool that is still not free is given up: it slides along the surface."""
+
+BISECTIONS = 12
+"""Halvings of the last step; they leave the tool within 1/4096 of it of touching."""
+
+GRAZING_DEPTH = 0.5
+"""Depth at the start, in the tool's half smallest width, below which it only grazes the points and would not press on them."""
 
 
-def depth(tool: Tool, pose: Tensor, particles: Tensor) -> float:
-    """How far the deepest particle lies inside of a tool grown by `CLEARANCE`, length units; zero or less where it is free.
-
-    Args:
-        tool: The tool.
-        pose: Its pose (8,).
-        particles: The clay (N, 3), length units.
-    """
-    return CLEARANCE - float(signed_distance(tool, pose, particles).min())
-
-
-def way_out(tool: Tool, pose: Tensor, direction: Tensor, particles: Tensor, *, farthest: float) -> float:
-    """How far a tool has to move along a direction until it is `CLEARANCE` away from the clay, length units.
-
-    A tool that reaches a depth into the clay is not free before it has moved by that depth, so that steps of that length miss
-    no way out, but for gaps smaller than `LEAST_STEP`.
+def tool_half_extents(tool: Tool, quaternion: Tensor) -> Tensor:
+    """Half edges of the axis-aligned box around a rotated tool.
 
     Args:
         tool: The tool.
-        pose: Its pose (8,).
-        direction: Unit vector (3,).
-        particles: The clay (N, 3), length units.
-        farthest: How far it may go, length units.
+        quaternion: Its rotation (4,), unit quaternion wxyz.
 
     Returns:
-        The length; 0 where the tool is free, infinity where it is not free within `farthest`.
+        Half edges (3,) along the world's axes, length units.
+
+    Raises:
+        InputError: `tool` is no tool.
     """
-    # In the tool's frame, the clay that it can meet on its way lies in a tube.
-    points, way = rotate_inverse(pose[3:7], particles - pose[:3]), rotate_inverse(pose[3:7], direction)
-    half_extents = shape_of(tool, gap=float(pose[7])).half_extents(torch.eye(3).to(points))
-    radius = float(torch.linalg.vector_norm(half_extents)) + CLEARANCE
-    points = points[torch.linalg.vector_norm(points - (points @ way)[:, None] * way, dim=-1) <= radius]
-    if not len(points):
-        return 0.0
+    axes = rotate(quaternion, torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)).T.abs()
+    return shape_of(tool).half_extents(axes)
 
-    def gap(length: float) -> float:
-        return float(local_distance(tool, *(points - length * way).unbind(-1), gap=pose[7]).min()) - CLEARANCE
 
-    length, found, step = 0.0, gap(0.0), 0.0
-    while found < 0.0:
-        step = max(-found, LEAST_STEP)
-        length += step
-        if length > farthest:
-            return math.inf
-        found = gap(length)
-    if length > 0.0:
-        for _ in range(BISECTIONS):
-            step *= 0.5
-            length = length - step if gap(length - step) >= 0.0 else length
-    return length
+def reduce_distances(
+    tool: Tool, quaternion: Tensor, positions: Tensor, points: Tensor, reduction: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Reduce the distances of points to a tool at each of several positions, in bounded memory.
+
+    Args:
+        tool: The tool, at its start gap.
+        quaternion: Its rotation (4,), unit quaternion wxyz.
+        positions: Tool positions (G, 3), length units.
+        points: Points (P, 3), length units.
+        reduction: Maps distances (g, P) of a piece of the positions to numbers (g,).
+
+    Returns:
+        Numbers (G,).
+    """
+    shape, local_points = shape_of(tool), rotate_inverse(quaternion, points).unbind(-1)
+    step = max(1, CHUNK_DISTANCES // max(1, points.shape[0]))
+    parts = []
+    for chunk in torch.split(rotate_inverse(quaternion, positions), step):
+        axes = [point - origin.unsqueeze(-1) for point, origin in zip(local_points, chunk.unbind(-1), strict=True)]
+        parts.append(reduction(shape.quick_distance(*axes)))
+    return torch.cat(parts) if parts else positions.new_empty(0)
+
+
+def smallest_gaps(tool: Tool, quaternion: Tensor, positions: Tensor, points: Tensor, *, reach: float = 0.0) -> Tensor:
+    """Distance (G,) between a tool at each position (G, 3) and the nearest of the points (P, 3); exact up to `reach`.
+
+    A larger distance may come out as infinity.
+    """
+    if not positions.shape[0]:
+        return positions.new_empty(0)
+    # Only what lies in the box swept by the tool can be that near.
+    box = tool_half_extents(tool, quaternion) + reach
+    near = ((points >= positions.amin(0) - box) & (points <= positions.amax(0) + box)).all(dim=-1)
+    if not bool(near.any()):
+        return torch.full_like(positions[:, 0], torch.inf)
+    return reduce_distances(tool, quaternion, positions, points[near], lambda distance: distance.amin(dim=-1))
+
+
+def exit_distances(
+    tool: Tool,
+    quaternion: Tensor,
+    starts: Tensor,
+    direction: Tensor,
+    points: Tensor,
+    *,
+    reach: float,
+    clearance: float = 0.0,
+    least_depth: float | None = None,
+) -> Tensor:
+    """How far a tool has to move along a direction until it is free of all points for the first time.
+
+    Since a distance changes by no more than the tool moves, a tool that reaches a depth into the points is not free before it
+    has moved by that depth: such steps never pass over a gap that is wide enough for the tool.
+
+    Args:
+        tool: The tool.
+        quaternion: Its rotation (4,), unit quaternion wxyz.
+        starts: Positions (G, 3) to start from, length units.
+        direction: Unit vector (3,).
+        points: Points (P, 3) to get free of, length units.
+        reach: The farthest to move, length units.
+        clearance: Distance that counts as free, length units.
+        least_depth: How deep it has to reach into the points at its start, length units, negative for a distance from them;
+            defaults to `GRAZING_DEPTH`.
+
+    Returns:
+        Distances (G,), length units, at which the tool is free and touches; infinity where it is not free within `reach`, or
+        not deep enough at its start.
+    """
+    lengths = torch.full_like(starts[:, 0], torch.inf)
+    depth = GRAZING_DEPTH * float(tool_half_extents(tool, quaternion).min()) if least_depth is None else least_depth
+    gaps = smallest_gaps(tool, quaternion, starts, points, reach=max(0.0, -depth))
+    active = torch.nonzero(gaps <= -depth).flatten()
+    moved, gaps, steps = torch.zeros_like(gaps)[active], gaps[active], torch.zeros_like(gaps)
+
+    def gaps_at(lines: Tensor, distances: Tensor) -> Tensor:
+        positions = starts[lines] + distances.unsqueeze(-1) * direction
+        return smallest_gaps(tool, quaternion, positions, points, reach=clearance)
+
+    for _ in range(MOST_STEPS):
+        step = (clearance - gaps).clamp(min=SMALLEST_STEP)
+        moved = moved + step
+        gaps = gaps_at(active, moved)
+        free = gaps >= clearance
+        lengths[active[free]], steps[active[free]] = moved[free], step[free]
+        going = ~free & (moved <= reach)
+        active, moved, gaps = active[going], moved[going], gaps[going]
+        if not active.numel():
+            break
+    found = torch.nonzero(torch.isfinite(lengths)).flatten()
+    high, step = lengths[found], steps[found]
+    for _ in range(BISECTIONS):
+        step = 0.5 * step
+        high = torch.where(gaps_at(found, high - step) >= clearance, high - step, high)
+    lengths[found] = high
+    return lengths

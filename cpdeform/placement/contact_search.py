@@ -8,12 +8,11 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from cpdeform.core.clearance import reduce_distances, tool_half_extents
 from cpdeform.core.scene import Tool
 from cpdeform.placement.grasp import Cost
 from cpdeform.placement.grid import GridOptions, ToolGrid
 from cpdeform.placement.priorities import Exploration
-from cpdeform.placement.tool import tool_half_extents
-from cpdeform.placement.touch import reduce_distances
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from cpdeform.core.clearance import exit_distances, tool_half_extents
 from cpdeform.core.scene import Tool
 from cpdeform.placement.pose import turned
-from cpdeform.placement.tool import placed_surface, tool_half_extents
-from cpdeform.placement.touch import exit_distances
+from cpdeform.placement.tool import placed_surface
 
 LATERAL_REACH = 0.9
 """Offsets aside of the contact point, in the tool's half widths: the tool still faces the point."""

@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from cpdeform.core.clearance import CHUNK_DISTANCES, reduce_distances, smallest_gaps, tool_half_extents
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.placer import Stage
 from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Tool
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.placement.tool import placed_surface, surface_points, tool_half_extents
-from cpdeform.placement.touch import CHUNK_DISTANCES, reduce_distances, smallest_gaps
+from cpdeform.placement.tool import placed_surface, surface_points
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from cpdeform.core.clearance import reduce_distances
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate, Placer, PlacerCapabilities, Proposal, Stage
 from cpdeform.core.scene import Tool, Vector3
 from cpdeform.placement.grasp import TOOLS_PER_GRASP, GraspSearch
 from cpdeform.placement.grid import GridOptions, ToolGrid, movable_tools
 from cpdeform.placement.pose import GRASP_DIRECTIONS
-from cpdeform.placement.touch import reduce_distances
 
 SURFACE_NEIGHBOURS = 48
 SURFACE_OFFSET = 0.25

@@ -5,27 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from cpdeform.core.clearance import tool_half_extents
 from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Tool, ToolMesh
 from cpdeform.core.shapes.tool import shape_of
 from cpdeform.core.signed_distance import local_distance
-
-
-def tool_half_extents(tool: Tool, quaternion: Tensor) -> Tensor:
-    """Half edges of the axis-aligned box around a rotated tool.
-
-    Args:
-        tool: The tool.
-        quaternion: Its rotation (4,), unit quaternion wxyz.
-
-    Returns:
-        Half edges (3,) along the world's axes, length units.
-
-    Raises:
-        InputError: `tool` is no tool.
-    """
-    axes = rotate(quaternion, torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)).T.abs()
-    return shape_of(tool).half_extents(axes)
 
 
 def surface_points(tool: Tool, *, resolution: int = 12) -> Tensor:

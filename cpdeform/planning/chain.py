@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from cpdeform.core.clearance import depth, way_out
+from cpdeform.core.clearance import CLEARANCE, exit_distances
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.final_gradient import takes_final_gradient
 from cpdeform.core.scene import Scene, Tool
@@ -155,9 +155,8 @@ def moved_out(tool: Tool, pose: Tensor, motion: Tensor, particles: Tensor) -> Te
     direction = torch.nn.functional.pad(-motion.detach(), (0, 3 - len(motion)))
     length = float(torch.linalg.vector_norm(direction))
     direction = direction / length if length > 0.0 else direction.new_tensor([0.0, 1.0, 0.0])
-    if depth(tool, pose, particles) <= ROUNDING:
-        return pose
-    gone = way_out(tool, pose, direction, particles, farthest=FARTHEST)
+    way = {"reach": FARTHEST, "clearance": CLEARANCE, "least_depth": ROUNDING - CLEARANCE}
+    gone = float(exit_distances(tool, pose[3:7], pose[None, :3], direction, particles, **way)[0])
     if not math.isfinite(gone):
         return pose
     found = pose.clone()

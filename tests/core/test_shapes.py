@@ -9,6 +9,7 @@ from torch import Tensor
 from toy_cone import ShapeCone, ToolCone
 
 from cpdeform.backends.scene_numbers import MOST_LENGTHS, tool_size
+from cpdeform.core.clearance import tool_half_extents
 from cpdeform.core.errors import InputError
 from cpdeform.core.meshes.filling import even_points
 from cpdeform.core.rotation import from_rotation_vector, rotate
@@ -29,7 +30,7 @@ from cpdeform.core.shapes.box import ARC_POINTS, ShapeBox
 from cpdeform.core.shapes.kinds import BODIES, TOOLS
 from cpdeform.core.shapes.mesh import BodyMesh, ToolMesh
 from cpdeform.core.signed_distance import local_distance, signed_distance
-from cpdeform.placement.tool import surface_points, tool_half_extents
+from cpdeform.placement.tool import surface_points
 from cpdeform.report.shapes import tool_surface
 
 ORIGIN = (0.0, 0.0, 0.0)

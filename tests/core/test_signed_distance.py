@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from cpdeform.core.clearance import tool_half_extents
 from cpdeform.core.errors import InputError
 from cpdeform.core.rotation import from_rotation_vector, multiply, rotate
 from cpdeform.core.scene import (
@@ -23,7 +24,7 @@ from cpdeform.core.scene import (
     ToolTorus,
 )
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.placement.tool import surface_points, tool_half_extents
+from cpdeform.placement.tool import surface_points
 
 ORIGIN = (0.0, 0.0, 0.0)
 TOOLS: dict[str, Tool] = {

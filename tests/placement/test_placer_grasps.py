@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from cpdeform.core.clearance import exit_distances
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate, Proposal, Stage
 from cpdeform.core.rotation import rotate
@@ -17,7 +18,6 @@ from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
 from cpdeform.placement.pose import GRASP_DIRECTIONS, turned
 from cpdeform.placement.random import PlacerRandom
-from cpdeform.placement.touch import exit_distances
 from cpdeform.placement.transport import PlacerTransport
 from cpdeform.testing.placer import transport_of
 

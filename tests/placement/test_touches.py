@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from cpdeform.core.clearance import CLEARANCE, LEAST_STEP
+from cpdeform.core.clearance import CLEARANCE, SMALLEST_STEP, tool_half_extents
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate, Stage
 from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Scene
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
-from cpdeform.placement.tool import tool_half_extents
 from cpdeform.placement.touches.pinch import TouchPinch
 from cpdeform.placement.touches.placer import PlacerTouch, place
 from cpdeform.placement.touches.push import TouchPress, TouchPush
@@ -92,7 +91,7 @@ def test_tools_move_towards_the_clay_and_back_off_at_the_end() -> None:
     # It stands on the far side of the block and pushes it along; it just does not touch.
     assert float(poses[0, 0]) < 0.36
     gap = float(signed_distance(stage.scene.tools[0], poses[0], room.particles).min())
-    assert CLEARANCE <= gap + 1e-6 < CLEARANCE + LEAST_STEP
+    assert CLEARANCE <= gap + 1e-6 < CLEARANCE + SMALLEST_STEP
     assert torch.allclose(actions[:8, 0], torch.full((8,), 0.04 / 8 / 0.02))
     assert bool((actions[8:, 0] < 0.0).all())
     assert not actions[:, 1:].any()

@@ -11,12 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from cpdeform.core.clearance import exit_distances
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Stage
 from cpdeform.core.plugins import Registry
 from cpdeform.core.reading.json_text import read_json
 from cpdeform.placement.grid import movable_tools
-from cpdeform.placement.touch import exit_distances
 from cpdeform.planning.algorithm import Planner, stage_generator
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.pruner import PrunerNone

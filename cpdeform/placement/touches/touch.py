@@ -11,14 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cpdeform.core.clearance import depth, way_out
+from cpdeform.core.clearance import CLEARANCE, exit_distances, tool_half_extents
 from cpdeform.core.rotation import multiply, rotate
 from cpdeform.core.scene import Scene, Tool
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.placement.tool import tool_half_extents
 
-LEAST_DEPTH = 1e-3
-"""How deep a tool at the contact point has to reach into the clay, length units."""
+LEAST_DEPTH = 5e-4
+"""How deep a tool at the contact point has to reach into the clay, length units: otherwise it would pass it by."""
 
 REACH = 0.4
 """How far behind a contact point a tool is looked for, length units."""
@@ -85,10 +84,8 @@ class Room:
         low = self.floor + float(tool_half_extents(tool, rotation)[1])
         start = contact.clone()
         start[1] = max(float(start[1]), low)
-        inside = torch.cat([start, rotation, self.poses[index, 7:]])
-        # A tool that hardly reaches the clay here would pass it by.
-        pressing = depth(tool, inside, self.particles) >= LEAST_DEPTH
-        length = way_out(tool, inside, -direction, self.particles, farthest=REACH) if pressing else math.inf
+        way = {"reach": REACH, "clearance": CLEARANCE, "least_depth": LEAST_DEPTH}
+        length = float(exit_distances(tool, rotation, start.unsqueeze(0), -direction, self.particles, **way)[0])
         position = start - length * direction
         lower, upper = position.new_tensor(tool.lower_bound), position.new_tensor(tool.upper_bound)
         within = math.isfinite(length) and bool(((position >= lower) & (position <= upper)).all())

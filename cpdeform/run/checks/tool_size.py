@@ -7,8 +7,8 @@ import math
 import numpy as np
 import torch
 
+from cpdeform.core.clearance import tool_half_extents
 from cpdeform.core.scene import Scene, Tool
-from cpdeform.placement.tool import tool_half_extents
 
 LEAST_INFLUENCE = 0.1
 """Share of a tool's velocity below which a node is not touched (PlasticineLab's constant)."""

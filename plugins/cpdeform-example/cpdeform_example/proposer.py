@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from cpdeform import Proposal, Proposer
+from cpdeform.core.clearance import exit_distances
 from cpdeform.placement.contact_search import ContactSearch
-from cpdeform.placement.touch import exit_distances
 
 REACH = 0.5
 """How far above the contact point the tool may have to begin, length units."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -39,7 +40,7 @@ class PlacerBayesian(Placer):
     """Proposes contact plans by Bayesian optimisation [1]_, by Optuna's Gaussian process through ask and tell.
 
     The first third of a stage's evaluations is random and shares one round, the others come one by one. The value of a plan is the
-    loss that the phases of the stage bring it to.
+    loss that the phases of the stage bring it to; that of a plan without room for the tools is the loss of doing nothing.
 
     Args:
         evaluations: Contact plans of a stage.
@@ -77,7 +78,8 @@ class PlacerBayesian(Placer):
                 numbers = [trial.suggest_float(f"contact_{number}", 0.0, 1.0) for number in range(search.space.size)]
                 found = search.space.place(torch.tensor(numbers, dtype=torch.float64))
                 if found is None:
-                    search.study.tell(trial, state=_failed())
+                    # A failed trial teaches the process nothing, and it would propose the same place again and again.
+                    _tell(search.study, trial, stage.loss)
                     continue
                 search.trials.append(trial)
                 label = f"bayesopt-{search.evaluations + len(proposals) + 1}"
@@ -92,8 +94,7 @@ class PlacerBayesian(Placer):
             return False
         with _quiet():
             for trial, result in zip(search.trials, results, strict=True):
-                known = result.loss == result.loss and result.loss < float("inf")
-                search.study.tell(trial, result.loss) if known else search.study.tell(trial, state=_failed())
+                _tell(search.study, trial, result.loss)
         search.trials = []
         return search.evaluations < self.evaluations
 
@@ -130,10 +131,14 @@ def _study(seed: int, startup: int) -> Any:
         return optuna.create_study(sampler=sampler)
 
 
-def _failed() -> Any:
+def _tell(study: Any, trial: Any, loss: float) -> None:
+    """Tell the loss of a plan; one that is not finite as a failure."""
     from optuna.trial import TrialState
 
-    return TrialState.FAIL
+    if math.isfinite(loss):
+        study.tell(trial, loss)
+    else:
+        study.tell(trial, state=TrialState.FAIL)
 
 
 @contextlib.contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from cpdeform.core.clearance import exit_distances, reduce_distances
 from cpdeform.core.placer import Stage
 from cpdeform.core.scene import Tool
 from cpdeform.placement.grasp import TOOLS_PER_GRASP, GraspSearch
@@ -12,7 +13,6 @@ from cpdeform.placement.grid import movable_tools
 from cpdeform.placement.pose import GRASP_DIRECTIONS
 from cpdeform.placement.random import surface_particles
 from cpdeform.placement.tool import placed_surface
-from cpdeform.placement.touch import exit_distances, reduce_distances
 
 NEIGHBOURS = 48
 """Particles that the direction off the surface is taken from."""
