@@ -15,11 +15,13 @@ from cpdeform.core.placer import Candidate, Placer, Stage
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
 from cpdeform.run.result import RunResult
+from cpdeform.testing import check_placer
 from cpdeform_baselines.searches.bayesopt import PlacerBayesian
 from cpdeform_baselines.searches.cma import PlacerEvolution
 from cpdeform_baselines.searches.contacts import ContactSpace
 from cpdeform_baselines.searches.motions import interpolated
 from cpdeform_baselines.searches.mppi import PlacerPathIntegral, path_integral_weights
+from cpdeform_baselines.searches.sampled import PlacerSamples
 
 LINES = 200
 
@@ -104,6 +106,23 @@ def test_the_gaussian_process_goes_where_losses_are_low(stage: Stage) -> None:
 
 def test_losses_that_are_not_finite_are_no_news_to_the_process(stage: Stage) -> None:
     assert len(search(PlacerBayesian(evaluations=4), stage, lambda proposal: float("nan"))) == 4
+
+
+def test_the_process_looks_elsewhere_where_there_is_no_room(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing fits in three quarters of the plans; where nothing fits at all, the search ends."""
+    place, tried = ContactSpace.place, list[float]()
+
+    def partly(self, numbers):
+        tried.append(float(numbers[0]))
+        return place(self, numbers) if numbers[0] > 0.75 else None
+
+    monkeypatch.setattr(ContactSpace, "place", partly)
+    found = search(PlacerBayesian(evaluations=6), stage, lambda proposal: 0.5)
+    assert len(found) == 6
+    guided = tried[-4:]
+    assert sum(number > 0.75 for number in guided) >= 3
+    monkeypatch.setattr(ContactSpace, "place", lambda self, numbers: None)
+    assert search(PlacerBayesian(evaluations=6), stage, lambda proposal: 0.5) == []
 
 
 def test_evolution_lowers_the_loss_over_generations(stage: Stage) -> None:
@@ -193,3 +212,17 @@ def test_a_seed_repeats(task: Task) -> None:
 def test_unusable_options(task: Task, name: str, options: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         deform(task, strategy=name, settings={"strategy_options": options})
+
+
+@pytest.mark.parametrize(
+    "placer",
+    [
+        PlacerBayesian(evaluations=6),
+        PlacerEvolution(generations=2, population=4),
+        PlacerPathIntegral(samples=4, updates=2),
+        PlacerSamples(samples=4),
+    ],
+    ids=lambda placer: type(placer).__name__,
+)
+def test_the_authors_kit_passes_the_placers(placer: Placer) -> None:
+    check_placer(placer).raise_if_failed()

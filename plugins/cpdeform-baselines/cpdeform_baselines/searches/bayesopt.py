@@ -27,20 +27,34 @@ TRIES = 20
 
 @dataclasses.dataclass
 class _Search:
-    """The state of a stage's search."""
+    """The state of a stage's search.
+
+    Attributes:
+        stage: The stage.
+        space: Its contact plans.
+        study: Optuna's study.
+        trials: Its trials of the last round.
+        evaluations: Plans proposed so far.
+        worst: The highest loss known, that of doing nothing among them; -inf for none.
+    """
 
     stage: Stage
     space: ContactSpace
     study: Any
     trials: list[Any] = dataclasses.field(default_factory=list)
     evaluations: int = 0
+    worst: float = -math.inf
+
+    def __post_init__(self) -> None:
+        if math.isfinite(self.stage.loss):
+            self.worst = self.stage.loss
 
 
 class PlacerBayesian(Placer):
     """Proposes contact plans by Bayesian optimisation [1]_, by Optuna's Gaussian process through ask and tell.
 
     The first third of a stage's evaluations is random and shares one round, the others come one by one. The value of a plan is the
-    loss that the phases of the stage bring it to; that of a plan without room for the tools is the loss of doing nothing.
+    loss that the phases of the stage bring it to; that of a plan without room is the worst one known.
 
     Args:
         evaluations: Contact plans of a stage.
@@ -79,7 +93,7 @@ class PlacerBayesian(Placer):
                 found = search.space.place(torch.tensor(numbers, dtype=torch.float64))
                 if found is None:
                     # A failed trial teaches the process nothing, and it would propose the same place again and again.
-                    _tell(search.study, trial, stage.loss)
+                    _tell(search.study, trial, search.worst)
                     continue
                 search.trials.append(trial)
                 label = f"bayesopt-{search.evaluations + len(proposals) + 1}"
@@ -95,8 +109,9 @@ class PlacerBayesian(Placer):
         with _quiet():
             for trial, result in zip(search.trials, results, strict=True):
                 _tell(search.study, trial, result.loss)
+        search.worst = max([search.worst, *(result.loss for result in results if math.isfinite(result.loss))])
         search.trials = []
-        return search.evaluations < self.evaluations
+        return bool(results) and search.evaluations < self.evaluations
 
 
 class StrategyBayesian(Strategy):
