@@ -8,6 +8,9 @@ NATIVE := $(VENV)/.native
 NATIVE_SOURCES := $(shell find plugins/cpdeform-native -name '*.cpp' -o -name '*.h' -o -name CMakeLists.txt -o -name pyproject.toml)
 COMPILER := $(shell command -v $${CXX:-c++} 2>/dev/null)
 OUT ?= runs/first
+# Processes that the tests are shared out to; each file's tests stay together.
+WORKERS ?= 2
+PYTEST := python -m pytest -n $(WORKERS) --dist loadfile
 
 SANITIZED := plugins/cpdeform-native/build/sanitized
 
@@ -17,16 +20,16 @@ run: $(NATIVE)
 	$(BIN)/cpdeform run writer --out $(OUT) --overwrite
 
 test: $(NATIVE)
-	$(BIN)/python -m pytest
-	cd plugins/cpdeform-example && ../../$(BIN)/python -m pytest
-	cd plugins/cpdeform-gymnasium && ../../$(BIN)/python -m pytest
-	cd plugins/cpdeform-baselines && ../../$(BIN)/python -m pytest
+	$(BIN)/$(PYTEST)
+	cd plugins/cpdeform-example && ../../$(BIN)/$(PYTEST)
+	cd plugins/cpdeform-gymnasium && ../../$(BIN)/$(PYTEST)
+	cd plugins/cpdeform-baselines && ../../$(BIN)/$(PYTEST)
 ifneq ($(COMPILER),)
-	cd plugins/cpdeform-native && ../../$(BIN)/python -m pytest
+	cd plugins/cpdeform-native && ../../$(BIN)/$(PYTEST)
 endif
 
 quick: $(NATIVE)
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/$(PYTEST) -m "not slow"
 
 # 12,000 damaged files and options, killed and interrupted runs, full disks, some minutes; `make test` tries a part of them.
 faults: $(NATIVE)
