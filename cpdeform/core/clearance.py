@@ -9,6 +9,7 @@ from torch import Tensor
 
 from cpdeform.core.rotation import rotate, rotate_inverse
 from cpdeform.core.scene import Tool
+from cpdeform.core.shapes.base import Shape
 from cpdeform.core.shapes.tool import shape_of
 
 CLEARANCE = 5e-4
@@ -62,13 +63,24 @@ def reduce_distances(
     Returns:
         Numbers (G,).
     """
-    shape, local_points = shape_of(tool), rotate_inverse(quaternion, points).unbind(-1)
+    local_positions, local_points = rotate_inverse(quaternion, positions), rotate_inverse(quaternion, points)
+    return _reduce_local(shape_of(tool), local_positions, local_points, reduction)
+
+
+def _reduce_local(shape: Shape, positions: Tensor, points: Tensor, reduction: Callable[[Tensor], Tensor]) -> Tensor:
+    """Reduce the distances of points (P, 3) to a shape at positions (G, 3), all in its local frame, to numbers (G,)."""
     step = max(1, CHUNK_DISTANCES // max(1, points.shape[0]))
+    coordinates = points.unbind(-1)
     parts = []
-    for chunk in torch.split(rotate_inverse(quaternion, positions), step):
-        axes = [point - origin.unsqueeze(-1) for point, origin in zip(local_points, chunk.unbind(-1), strict=True)]
+    for chunk in torch.split(positions, step):
+        axes = [point - origin.unsqueeze(-1) for point, origin in zip(coordinates, chunk.unbind(-1), strict=True)]
         parts.append(reduction(shape.quick_distance(*axes)))
     return torch.cat(parts) if parts else positions.new_empty(0)
+
+
+def _within(points: Tensor, positions: Tensor, extents: Tensor) -> Tensor:
+    """Which points (P,) lie in the box around positions (G, 3), grown by half edges (3,), length units."""
+    return ((points >= positions.amin(0) - extents) & (points <= positions.amax(0) + extents)).all(dim=-1)
 
 
 def smallest_gaps(tool: Tool, quaternion: Tensor, positions: Tensor, points: Tensor, *, reach: float = 0.0) -> Tensor:
@@ -79,8 +91,7 @@ def smallest_gaps(tool: Tool, quaternion: Tensor, positions: Tensor, points: Ten
     if not positions.shape[0]:
         return positions.new_empty(0)
     # Only what lies in the box swept by the tool can be that near.
-    box = tool_half_extents(tool, quaternion) + reach
-    near = ((points >= positions.amin(0) - box) & (points <= positions.amax(0) + box)).all(dim=-1)
+    near = _within(points, positions, tool_half_extents(tool, quaternion) + reach)
     if not bool(near.any()):
         return torch.full_like(positions[:, 0], torch.inf)
     return reduce_distances(tool, quaternion, positions, points[near], lambda distance: distance.amin(dim=-1))
@@ -118,15 +129,25 @@ def exit_distances(
         not deep enough at its start.
     """
     lengths = torch.full_like(starts[:, 0], torch.inf)
-    depth = GRAZING_DEPTH * float(tool_half_extents(tool, quaternion).min()) if least_depth is None else least_depth
-    gaps = smallest_gaps(tool, quaternion, starts, points, reach=max(0.0, -depth))
-    active = torch.nonzero(gaps <= -depth).flatten()
-    moved, gaps, steps = torch.zeros_like(gaps)[active], gaps[active], torch.zeros_like(gaps)
+    extents = tool_half_extents(tool, quaternion)
+    depth = GRAZING_DEPTH * float(extents.min()) if least_depth is None else least_depth
+    # All is computed in the tool's frame, with the points that it may come near to on its way: rotating them at each step would
+    # take longer than their distances.
+    way = torch.cat([starts, starts + (reach + float(extents.max())) * direction])
+    near = _within(points, way, extents + max(clearance, -depth, 0.0))
+    if not bool(near.any()):
+        return lengths
+    local_points = rotate_inverse(quaternion, points[near])
+    local_starts, local_direction = rotate_inverse(quaternion, starts), rotate_inverse(quaternion, direction)
+    shape = shape_of(tool)
 
     def gaps_at(lines: Tensor, distances: Tensor) -> Tensor:
-        positions = starts[lines] + distances.unsqueeze(-1) * direction
-        return smallest_gaps(tool, quaternion, positions, points, reach=clearance)
+        positions = local_starts[lines] + distances.unsqueeze(-1) * local_direction
+        return _reduce_local(shape, positions, local_points, lambda distance: distance.amin(dim=-1))
 
+    gaps = gaps_at(torch.arange(len(starts), device=starts.device), torch.zeros_like(lengths))
+    active = torch.nonzero(gaps <= -depth).flatten()
+    moved, gaps, steps = torch.zeros_like(gaps)[active], gaps[active], torch.zeros_like(gaps)
     for _ in range(MOST_STEPS):
         step = (clearance - gaps).clamp(min=SMALLEST_STEP)
         moved = moved + step
