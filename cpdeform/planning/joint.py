@@ -31,7 +31,7 @@ def polish_jointly(planner: Planner, results: Sequence[StageResult], optimizer: 
 
     Args:
         planner: The parts.
-        results: Consecutive stages; those without a plan stay as they are.
+        results: Consecutive stages; those without a plan stay without one.
         optimizer: How.
 
     Returns:
@@ -52,7 +52,9 @@ def polish_jointly(planner: Planner, results: Sequence[StageResult], optimizer: 
         executed = planned
     seconds = (time.perf_counter() - begun) / len(planned)
     polished = iter([_accounted(result, seconds, found, last=result is executed[-1]) for result in executed])
-    final = [result if result.actions is None else next(polished) for result in results]
+    final: list[StageResult] = []
+    for result in results:
+        final.append(_idle_after(result, final) if result.actions is None else next(polished))
     if found.interruption is not None:
         raise StagesInterrupted(final) from found.interruption
     return final
@@ -135,6 +137,15 @@ def _execute(planner: Planner, planned: Sequence[StageResult], plan: Tensor) -> 
             )
         )
     return executed
+
+
+def _idle_after(result: StageResult, before: Sequence[StageResult]) -> StageResult:
+    """A stage without a plan, where the stages before it may have ended elsewhere."""
+    if not before:
+        return result
+    last = before[-1]
+    ends = {"state_before": last.state, "state": last.state, "loss_before": last.loss, "loss": last.loss, "warm": last.warm}
+    return dataclasses.replace(result, **ends)
 
 
 def _with_plan(result: StageResult, start: State, actions: Tensor, loss: float) -> tuple[Candidate, ...]:

@@ -88,13 +88,16 @@ def test_stages_are_polished_together_and_hang_together(task):
     assert {iteration.phase for iteration in after[-1].history[-OPTIMIZER.iterations :]} == {PHASE}
 
 
-def test_stages_without_a_plan_stay_as_they_are(task):
+def test_stages_without_a_plan_take_the_state_of_the_one_before(task):
     parts = planner(task)
     found = list(parts.run(stages=2).stages)
     idle = dataclasses.replace(found[1], index=2, best=None, actions=None, status=Status.NO_IMPROVEMENT)
     after = polish_jointly(parts, [*found, idle], OPTIMIZER)
-    assert after[2] is idle
     assert after[1].loss < found[1].loss
+    # What comes next begins where the polished stages end, not where they had ended before.
+    assert after[2].state is after[2].state_before is after[1].state
+    assert (after[2].loss, after[2].loss_before) == (after[1].loss, after[1].loss)
+    assert (after[2].status, after[2].actions) == (Status.NO_IMPROVEMENT, None)
     assert polish_jointly(parts, [idle], OPTIMIZER) == [idle]
 
 
@@ -121,8 +124,9 @@ class Interrupt(Observer):
         self.told.append(result)
 
 
-def sculpted(task, *, simulator=SimulatorChained, **options):
-    strategy = StrategySculpt(touches=8, variations=4, iterations=(1, 1), together=2, joint_iterations=5)
+def sculpted(task, *, simulator=SimulatorChained, changes=None, **options):
+    numbers = {"touches": 8, "variations": 4, "iterations": (1, 1), "together": 2, "joint_iterations": 5, **(changes or {})}
+    strategy = StrategySculpt(**numbers)
     parts = {"simulator": simulator(task.scene, batch_size=4), "ot_solver": OTSolverToy()}
     return deform(task, strategy=strategy, settings={"objective": {"points": None}}, **parts, seed=1, **options)
 
@@ -134,6 +138,17 @@ def test_the_strategy_polishes_two_stages_at_a_time(task):
     assert all(PHASE in stage.seconds for stage in result.stages)
     alone = sculpted(task, simulator=SimulatorToy)
     assert not any(PHASE in stage.seconds for stage in alone.stages)
+
+
+def test_stages_are_polished_on_the_way_and_once_more_at_the_end(task):
+    """All three together at the end; the first two on their way, and the third one goes on from where these then end."""
+    result = sculpted(task, changes={"together": 3, "joint_every": 2, "interim_iterations": 2})
+    counts = [sum(iteration.phase == PHASE for iteration in stage.history) for stage in result.stages]
+    assert counts == [0, 2, 5]
+    first, second, third = result.stages
+    assert torch.equal(second.state.position, third.state_before.position)
+    assert torch.equal(first.state.position, second.state_before.position)
+    assert {stage.status for stage in result.stages} == {Status.FINISHED}
 
 
 def test_an_interruption_keeps_the_best_plans_so_far(task):

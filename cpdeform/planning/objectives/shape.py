@@ -14,8 +14,11 @@ from cpdeform.core.simulator import Trajectory
 from cpdeform.planning.objectives.mass import mass_grid
 from cpdeform.planning.objectives.transport import ObjectiveTransport
 
-SCALES = (64, 40, 24)
-"""Nodes along an edge of the domain of the grids that mass is compared on."""
+SCALES = (1.0, 0.625, 0.375)
+"""Nodes along an edge of the domain of the grids that mass is compared on, as parts of the scene's."""
+
+LEAST_NODES = 8
+"""The least nodes of such a grid."""
 
 
 class ObjectiveShape(Objective):
@@ -47,7 +50,7 @@ class ObjectiveShape(Objective):
             raise InputError("density_weight", came=str(density_weight), expected="a finite number of at least 0")
         self._transport, self._weight, self._scene = transport, density_weight, scene
         self.goal, self.start = goal.detach(), start.detach()
-        self._scenes = [scene.model_copy(update={"grid_size": nodes}) for nodes in SCALES]
+        self._scenes = [scene.model_copy(update={"grid_size": max(LEAST_NODES, round(part * scene.grid_size))}) for part in SCALES]
         self._goals = [_shares(goal.detach(), scale) for scale in self._scenes]
         cost = float(transport.value(start.detach()))
         self._misplaced_start = float(self._misplaced(start.detach().unsqueeze(0))[0])
@@ -55,10 +58,16 @@ class ObjectiveShape(Objective):
         if not (cost > 0.0 and self._misplaced_start > 0.0):
             raise InputError("start", came="the goal itself", expected="a shape that differs from the goal")
 
-    def rebased(self, *, goal: Tensor, start: Tensor) -> ObjectiveShape:
-        """The same objective for another goal (M, 3) and another start (N, 3), length units, such as those at rest."""
+    def rebased(self, *, goal: Tensor, start: Tensor, scene: Scene | None = None) -> ObjectiveShape:
+        """The same objective for another goal (M, 3) and another start (N, 3), length units, such as those at rest.
+
+        Args:
+            goal: Goal particles.
+            start: Particles where the run begins.
+            scene: Another scene, such as one on a coarser grid; defaults to the same.
+        """
         transport = self._transport.with_goal(goal.to(self._transport.goal))
-        return ObjectiveShape(transport, self._scene, goal, start, density_weight=self._weight)
+        return ObjectiveShape(transport, scene or self._scene, goal, start, density_weight=self._weight)
 
     def evaluate(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> ObjectiveResult:
         """Loss and gradient of each world; the transport term is warm-started."""

@@ -9,12 +9,11 @@ import torch
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate
+from cpdeform.planning.coarse import CoarseModel
 from cpdeform.planning.optimizer import TrajectoryOptimizer
+from cpdeform.planning.phases.choice import best_unlike
 from cpdeform.planning.phases.phase import Phase, Scope
 from cpdeform.planning.workbench import Workbench
-
-MOST_ALIKE = 2
-"""Candidates of one label around one contact particle that are taken, at most: the best of a search are often variations of one."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,6 +34,7 @@ class PhasePolish(Phase):
     keep: int
     optimizer: TrajectoryOptimizer
     exclusive: bool = False
+    coarse: CoarseModel | None = None
     name: str = "polish"
 
     def __post_init__(self) -> None:
@@ -43,10 +43,14 @@ class PhasePolish(Phase):
 
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
         """All candidates, the best of them with better plans; unless `exclusive`, a plan is never worse than before."""
-        chosen = self._best(candidates)
+        chosen = best_unlike(candidates, self.keep)
         if not chosen:
             return candidates
-        found = bench.minimize([candidates[number] for number in chosen], self.optimizer, None, phase=self.name)
+        polished = [candidates[number] for number in chosen]
+        if self.coarse is None:
+            found = bench.minimize(polished, self.optimizer, None, phase=self.name)
+        else:
+            found = self.coarse.minimize(bench, polished, self.optimizer, phase=self.name)
         result = list(candidates)
         if self.exclusive:
             result = [dataclasses.replace(candidate, loss=torch.inf) for candidate in candidates]
@@ -54,18 +58,3 @@ class PhasePolish(Phase):
             if loss < result[number].loss:
                 result[number] = dataclasses.replace(candidates[number], loss=loss, actions=actions)
         return result
-
-    def _best(self, candidates: list[Candidate]) -> list[int]:
-        """Numbers of the candidates to be polished, the best first."""
-        losses = torch.tensor([candidate.loss for candidate in candidates], dtype=torch.float64).nan_to_num(nan=torch.inf)
-        chosen: list[int] = []
-        alike: dict[tuple[str, int | None], int] = {}
-        for number in losses.argsort(stable=True).tolist():
-            if len(chosen) == self.keep or not bool(torch.isfinite(losses[number])):
-                break
-            proposal = candidates[number].proposal
-            family = (proposal.label, proposal.contact_particle)
-            alike[family] = alike.get(family, 0) + 1
-            if alike[family] <= MOST_ALIKE:
-                chosen.append(number)
-        return chosen

@@ -21,6 +21,7 @@ from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.phase import Phase
 from cpdeform.planning.phases.polish import PhasePolish
 from cpdeform.planning.phases.screening import PhaseScreening
+from cpdeform.planning.phases.trial import PhaseTrial
 from cpdeform.planning.pruner import PrunerNone
 from cpdeform.planning.rest import rest, settle_goal
 from cpdeform.planning.result import StageResult, Status
@@ -31,6 +32,9 @@ MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
 
 SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
+
+TRIED = 4
+"""Plans of a coarser model that are tried on the scene itself."""
 
 
 class StrategySculpt(Strategy):
@@ -51,7 +55,9 @@ class StrategySculpt(Strategy):
         iterations: Gradient evaluations of each of them in these steps.
         together: Stages that are polished together, before any of them is final.
         joint_iterations: Gradient evaluations of each of them in that.
-        coarse: Whether touches are screened with fewer particles, where there are many; see `cpdeform.planning.coarse`.
+        joint_every: Stages after which those found so far are polished together on the way.
+        interim_iterations: Gradient evaluations of each of them in that.
+        coarse: Whether touches are looked for in a coarser model of the scene, where there is one; see `cpdeform.planning.coarse`.
         idle: Stages without a gain in a row after which the run ends.
 
     Raises:
@@ -65,22 +71,26 @@ class StrategySculpt(Strategy):
         variations: int = 32,
         polished: tuple[int, int] = (5, 2),
         iterations: tuple[int, int] = (4, 8),
-        together: int = 6,
-        joint_iterations: int = 40,
+        together: int = 12,
+        joint_iterations: int = 60,
+        joint_every: int = 3,
+        interim_iterations: int = 10,
         coarse: bool = True,
         idle: int = 3,
     ) -> None:
         numbers = {"touches": touches, "variations": variations, "idle": idle}
         numbers |= {"together": together, "joint_iterations": joint_iterations}
+        numbers |= {"joint_every": joint_every, "interim_iterations": interim_iterations}
         numbers |= {"polished": min(polished), "iterations": min(iterations)}
         for name, number in numbers.items():
             if number < 1:
                 raise InputError(name, came=str(number), expected="at least 1")
         self.touches, self.variations, self.idle = touches, variations, idle
         self.polished, self.iterations = tuple(polished), tuple(iterations)
-        self.together, self.coarse = together, coarse
-        self._joint = TrajectoryOptimizer(
-            iterations=joint_iterations, learning_rate=0.06, pruner=PrunerNone(), backtrack=3, annealed=True
+        self.together, self.joint_every, self.coarse = together, joint_every, coarse
+        self._interim, self._joint = (
+            TrajectoryOptimizer(iterations=count, learning_rate=0.06, pruner=PrunerNone(), backtrack=3, annealed=True)
+            for count in (interim_iterations, joint_iterations)
         )
 
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
@@ -110,16 +120,22 @@ class StrategySculpt(Strategy):
         """One touch a stage, from rest to rest, some polished together; a few stages without a gain do not end the run."""
         planner, start = from_rest(planner, start)
         if self.coarse:
-            planner = screened_coarsely(planner)
+            planner = searching_coarsely(planner)
         finished: list[StageResult] = []
         end = start.first_stage + start.stages
         for first in range(start.first_stage, end, self.together):
             found: list[StageResult] = []
+            stages = range(first, min(first + self.together, end))
             try:
-                for result in self._touches(planner, start, range(first, min(first + self.together, end)), finished):
-                    found.append(result)
-                if takes_final_gradient(planner.simulator):
-                    found = polish_jointly(planner, found, self._joint)
+                for part in _parts(stages, self.joint_every):
+                    for result in self._touches(planner, start, part, [*finished, *found]):
+                        found.append(result)
+                    over = self._is_over([*finished, *found])
+                    if takes_final_gradient(planner.simulator):
+                        last = over or part[-1] == stages[-1]
+                        found = polish_jointly(planner, found, self._joint if last else self._interim)
+                    if over:
+                        break
             except KeyboardInterrupt as interruption:
                 yield from interruption.results if isinstance(interruption, StagesInterrupted) else found
                 if isinstance(interruption, StageInterrupted):
@@ -147,11 +163,30 @@ class StrategySculpt(Strategy):
         return stuck or results[-1].status is Status.NON_FINITE
 
 
-def screened_coarsely(planner: Planner) -> Planner:
-    """A planner whose screening goes by fewer particles, where there are many and the loss is made for it."""
+def _parts(stages: range, size: int) -> list[range]:
+    """Stages in rows of at most `size`."""
+    return [stages[first : first + size] for first in range(0, len(stages), size)]
+
+
+def searching_coarsely(planner: Planner) -> Planner:
+    """A planner that looks for touches in a coarser model of the scene, where there is one and the loss is made for it.
+
+    On a coarser grid the first step of polishing is taken there, too, and the best plans are tried on the scene itself. With fewer
+    particles on the same grid they are only screened: there the gradients save little.
+    """
     objective = planner.objective
     model = CoarseModel.of(planner.simulator, objective) if isinstance(objective, ObjectiveShape) else None
-    phases = [dataclasses.replace(phase, coarse=model) if isinstance(phase, PhaseScreening) else phase for phase in planner.phases]
+    if model is None:
+        return planner
+    coarser_grid = model.simulator.scene.grid_size < planner.task.scene.grid_size
+    phases: list[Phase] = []
+    for phase in planner.phases:
+        if isinstance(phase, PhaseScreening):
+            phases.append(dataclasses.replace(phase, coarse=model))
+        elif isinstance(phase, PhasePolish) and phase.exclusive and coarser_grid:
+            phases += [dataclasses.replace(phase, coarse=model), PhaseTrial(keep=TRIED)]
+        else:
+            phases.append(phase)
     return dataclasses.replace(planner, phases=phases)
 
 

@@ -1,0 +1,33 @@
+"""Which candidates of a search are worth more work."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from cpdeform.core.placer import Candidate
+
+MOST_ALIKE = 2
+"""Candidates of one label around one contact particle that are taken, at most: the best of a search are often variations of one."""
+
+
+def best_unlike(candidates: Sequence[Candidate], count: int) -> list[int]:
+    """Numbers of the candidates with the lowest finite losses, the best first, at most `MOST_ALIKE` of one family.
+
+    Args:
+        candidates: All candidates of a search.
+        count: How many, at most.
+    """
+    losses = torch.tensor([candidate.loss for candidate in candidates], dtype=torch.float64).nan_to_num(nan=torch.inf)
+    chosen: list[int] = []
+    alike: dict[tuple[str, int | None], int] = {}
+    for number in losses.argsort(stable=True).tolist():
+        if len(chosen) == count or not bool(torch.isfinite(losses[number])):
+            break
+        proposal = candidates[number].proposal
+        family = (proposal.label, proposal.contact_particle)
+        alike[family] = alike.get(family, 0) + 1
+        if alike[family] <= MOST_ALIKE:
+            chosen.append(number)
+    return chosen
