@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cpdeform.core.task import Task
 from cpdeform.planning.optimizer import SEARCH, Iteration
-from cpdeform.planning.result import Observer, StageResult
+from cpdeform.planning.result import Observer, Revision, StageResult
 
 SECONDS_BETWEEN_LINES = 15.0
 
@@ -123,6 +123,10 @@ class ProgressBar(Progress):
         """Leave a line that stays."""
         self._print(_stage_line(result))
 
+    def stages_revised(self, revision: Revision) -> None:
+        """Leave a line that stays."""
+        self._print(_revision_line(revision))
+
     def _print(self, line: str) -> None:
         self._progress.console.print(line, highlight=False)
 
@@ -151,6 +155,10 @@ class ProgressLines(Progress):
         """Print a line."""
         self._print(_stage_line(result))
 
+    def stages_revised(self, revision: Revision) -> None:
+        """Print a line."""
+        self._print(_revision_line(revision))
+
 
 def megabytes(count: int) -> str:
     """Bytes as text, in megabytes of 1e6 bytes, or in gigabytes."""
@@ -168,3 +176,9 @@ def _stage_line(result: StageResult) -> str:
         f"stage {result.index + 1}: {result.status.value.replace('_', ' ')}, loss {result.loss_before:.4g} -> {result.loss:.4g}, "
         f"{len(result.candidates)} candidates, {result.seconds['total']:.1f} s"
     )
+
+
+def _revision_line(revision: Revision) -> str:
+    first, last = revision.results[0], revision.results[-1]
+    which = f"stage {last.index + 1}" if first is last else f"stages {first.index + 1} to {last.index + 1}"
+    return f"{which}: {revision.reason}, loss {first.loss_before:.4g} -> {last.loss:.4g}"

@@ -82,5 +82,10 @@ def cpdeform_stage_finished(result: Any) -> None:
 
 
 @hookspec
+def cpdeform_stages_revised(result: Any) -> None:
+    """Observe finished stages that got other plans, a `cpdeform.planning.result.Revision`."""
+
+
+@hookspec
 def cpdeform_run_finished(result: Any) -> None:
     """Observe a finished run, a `cpdeform.planning.result.DeformResult`."""

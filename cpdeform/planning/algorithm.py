@@ -31,7 +31,7 @@ from cpdeform.planning.interrupted import Execution, StageInterrupted, best_so_f
 from cpdeform.planning.metrics import evaluate_metric
 from cpdeform.planning.optimizer import Iteration
 from cpdeform.planning.phases.phase import Phase
-from cpdeform.planning.result import DeformResult, Observer, StageResult, Status
+from cpdeform.planning.result import DeformResult, Observer, Revision, StageResult, Status
 from cpdeform.planning.still import still_trajectory
 from cpdeform.planning.workbench import Workbench, is_finite
 
@@ -81,7 +81,7 @@ class Planner:
     objective: Objective
     phases: Sequence[Phase]
     problem: TransportProblem | None = None
-    loop: Callable[[Planner, Start], Iterator[StageResult]] | None = None
+    loop: Callable[[Planner, Start], Iterator[StageResult | Revision]] | None = None
     executor: Executor = dataclasses.field(default_factory=ExecutorSerial)
     seed: int = 0
     observers: tuple[Observer, ...] = ()
@@ -128,11 +128,16 @@ class Planner:
         for observer in self.observers:
             observer.run_started(self.task, goal, self.names, self.seed)
         start = Start(state=state, goal=goal, first_stage=first_stage, stages=count, previous=tuple(previous))
-        results = []
-        for result in (self.loop or contact_points_discovery)(self, start):
-            results.append(result)
-            for observer in self.observers:
-                observer.stage_finished(result)
+        results: list[StageResult] = []
+        for found in (self.loop or contact_points_discovery)(self, start):
+            if isinstance(found, Revision):
+                results[-len(found.results) :] = found.results
+                for observer in self.observers:
+                    observer.stages_revised(found)
+            else:
+                results.append(found)
+                for observer in self.observers:
+                    observer.stage_finished(found)
         metric = evaluate_metric(self.task, start=scene_start.position[0], final=results[-1].state.position[0], goal=goal)
         finished = DeformResult(
             task=self.task,

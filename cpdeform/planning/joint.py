@@ -144,8 +144,9 @@ def _idle_after(result: StageResult, before: Sequence[StageResult]) -> StageResu
     if not before:
         return result
     last = before[-1]
-    ends = {"state_before": last.state, "state": last.state, "loss_before": last.loss, "loss": last.loss, "warm": last.warm}
-    return dataclasses.replace(result, **ends)
+    return dataclasses.replace(
+        result, state_before=last.state, state=last.state, loss_before=last.loss, loss=last.loss, warm=last.warm
+    )
 
 
 def _with_plan(result: StageResult, start: State, actions: Tensor, loss: float) -> tuple[Candidate, ...]:

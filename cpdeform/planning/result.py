@@ -97,6 +97,19 @@ class StageResult:
 
 
 @dataclasses.dataclass(frozen=True)
+class Revision:
+    """Stages that a loop has given already, with other plans.
+
+    Attributes:
+        results: The stages as they are now, in order, up to the last one that was given.
+        reason: What changed them, e.g. ``"joint polish"``.
+    """
+
+    results: tuple[StageResult, ...]
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
 class DeformResult:
     """A whole run.
 
@@ -161,6 +174,9 @@ class Observer:
 
     def stage_finished(self, result: StageResult) -> None:
         """A stage is done."""
+
+    def stages_revised(self, revision: Revision) -> None:
+        """Stages that were done have other plans now; what `stage_finished` told of them no longer counts."""
 
     def run_finished(self, result: DeformResult) -> None:
         """The run is done."""

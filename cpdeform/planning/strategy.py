@@ -14,7 +14,7 @@ from cpdeform.planning.algorithm import Planner, Start, contact_points_discovery
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.descent import PhaseDescent, PhaseRefinement
 from cpdeform.planning.phases.phase import Phase
-from cpdeform.planning.result import StageResult
+from cpdeform.planning.result import Revision, StageResult
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,6 +79,6 @@ class Strategy(abc.ABC):
         objective, optimizer = parts.refinement
         return (*search, PhaseRefinement(objective=objective, optimizer=optimizer))
 
-    def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
-        """Lead from stage to stage; defaults to the loop of Algorithm 1."""
+    def loop(self, planner: Planner, start: Start) -> Iterator[StageResult | Revision]:
+        """Lead from stage to stage, and maybe come back to some; defaults to the loop of Algorithm 1."""
         return contact_points_discovery(planner, start)

@@ -6,11 +6,11 @@ import warnings
 
 import pluggy
 
-from cpdeform.planning.result import DeformResult, Observer, StageResult
+from cpdeform.planning.result import DeformResult, Observer, Revision, StageResult
 
 
 class HookObserver(Observer):
-    """Calls `cpdeform_stage_finished` and `cpdeform_run_finished` of every plugin.
+    """Calls `cpdeform_stage_finished`, `cpdeform_stages_revised` and `cpdeform_run_finished` of every plugin.
 
     A plugin that only watches must not cost the user hours of computation: what it raises becomes a `RuntimeWarning` that
     names the plugin, the other plugins are still called, and the run goes on.
@@ -26,11 +26,15 @@ class HookObserver(Observer):
         """Call `cpdeform_stage_finished`."""
         self._call("cpdeform_stage_finished", result)
 
+    def stages_revised(self, revision: Revision) -> None:
+        """Call `cpdeform_stages_revised`."""
+        self._call("cpdeform_stages_revised", revision)
+
     def run_finished(self, result: DeformResult) -> None:
         """Call `cpdeform_run_finished`."""
         self._call("cpdeform_run_finished", result)
 
-    def _call(self, hook: str, result: StageResult | DeformResult) -> None:
+    def _call(self, hook: str, result: StageResult | Revision | DeformResult) -> None:
         plugins = self._manager.get_plugins()
         for plugin in plugins:
             others = [other for other in plugins if other is not plugin]

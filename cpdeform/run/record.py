@@ -8,7 +8,8 @@
     went on from, or null; its stages go on counting, so that the first file is that of the stage after the other record's
     last one.
 ``metrics.jsonl``
-    A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage. ``time``
+    A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage,
+    ``"kind": "revision"`` where several stages up to that one got other plans, which their files then hold. ``time``
     is when an iteration was done (Unix seconds), ``gradient_norm`` that of its gradient by the actions.
 ``.run.lock``
     Number of the process that writes, while it does.
@@ -35,7 +36,7 @@ from cpdeform.core.errors import RecordError
 from cpdeform.core.memory import MemoryUse
 from cpdeform.core.task import Task
 from cpdeform.planning.optimizer import Iteration
-from cpdeform.planning.result import DeformResult, Observer, StageResult, Status
+from cpdeform.planning.result import DeformResult, Observer, Revision, StageResult, Status
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record_files import (
     GOAL_FILE,
@@ -204,6 +205,14 @@ class RunRecorder(Observer):
             write_stage(self.directory / stage_file(result.index), result)
             self._run["stages_finished"] += result.status.executed
             self._write_run()
+
+    def stages_revised(self, revision: Revision) -> None:
+        """Write the stages' files anew, the last one first: it is where a run that goes on begins."""
+        for result in reversed(revision.results):
+            with self._writing():
+                write_stage(self.directory / stage_file(result.index), result)
+        last = revision.results[-1]
+        self._append({"kind": "revision", "stage": last.index, "stages": len(revision.results), "loss": last.loss})
 
     def run_finished(self, result: DeformResult) -> None:
         """Complete the record."""

@@ -41,13 +41,19 @@ def test_observer_hooks_survive_a_failing_plugin(monkeypatch):
 
     points = [
         plugin(monkeypatch, "a", cpdeform_stage_finished=fail, cpdeform_run_finished=lambda result: seen.append(("a", result))),
-        plugin(monkeypatch, "b", cpdeform_stage_finished=lambda result: seen.append(("b", result))),
+        plugin(
+            monkeypatch,
+            "b",
+            cpdeform_stage_finished=lambda result: seen.append(("b", result)),
+            cpdeform_stages_revised=lambda result: seen.append(("b", result)),
+        ),
     ]
     observer = HookObserver(load_registry(points).manager)
     with pytest.warns(RuntimeWarning, match=r"plugin .*:a: cpdeform_stage_finished failed with RuntimeError: disk full"):
         observer.stage_finished("stage")
+    observer.stages_revised("revision")
     observer.run_finished("run")
-    assert seen == [("b", "stage"), ("a", "run")]
+    assert seen == [("b", "stage"), ("b", "revision"), ("a", "run")]
 
 
 def test_broken_plugins_are_reported_and_the_others_work(monkeypatch):

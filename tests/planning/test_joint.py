@@ -9,6 +9,7 @@ import torch
 from cpdeform_toy.parts import OTSolverToy, PlacerToy
 from cpdeform_toy.simulator import SimulatorToy
 
+from cpdeform.cli.progress import ProgressLines
 from cpdeform.core.objective import ObjectiveAutograd
 from cpdeform.core.simulator import RolloutGradient
 from cpdeform.core.task import load_task
@@ -21,6 +22,7 @@ from cpdeform.planning.pruner import PrunerNone
 from cpdeform.planning.result import Observer, Status
 from cpdeform.planning.strategies.sculpt import StrategySculpt
 from cpdeform.run.deform import deform
+from cpdeform.run.record import RunRecorder, load_record
 
 
 class SimulatorChained(SimulatorToy):
@@ -114,7 +116,7 @@ class Interrupt(Observer):
     """Control-C in the second iteration of the joint polish."""
 
     def __init__(self):
-        self.told = []
+        self.told, self.revised = [], []
 
     def iteration_finished(self, stage, iteration):
         if iteration.phase == PHASE and iteration.index == 1:
@@ -122,6 +124,9 @@ class Interrupt(Observer):
 
     def stage_finished(self, result):
         self.told.append(result)
+
+    def stages_revised(self, revision):
+        self.revised.append(revision)
 
 
 def sculpted(task, *, simulator=SimulatorChained, changes=None, **options):
@@ -156,11 +161,48 @@ def test_an_interruption_keeps_the_best_plans_so_far(task):
     with pytest.raises(KeyboardInterrupt):
         sculpted(task, observers=(watch,))
     assert [result.index for result in watch.told] == [0, 1]
-    assert all(result.status is Status.FINISHED for result in watch.told)
+    (revision,) = watch.revised
+    assert [result.index for result in revision.results] == [0, 1]
+    assert all(result.status is Status.FINISHED for result in revision.results)
     # What was computed until then counts, and its gain is executed.
-    tried = [iteration for iteration in watch.told[-1].history if iteration.phase == PHASE]
+    last = revision.results[-1]
+    tried = [iteration for iteration in last.history if iteration.phase == PHASE]
     assert len(tried) == 2
-    assert watch.told[-1].loss <= float(tried[0].loss[0])
+    assert last.loss <= float(tried[0].loss[0])
+
+
+def test_progress_tells_of_revisions(task, capsys):
+    lines = ProgressLines()
+    result = sculpted(task, observers=(lines,))
+    first, second = (result.stages[index] for index in (0, 1))
+    text = f"stages 1 to 2: joint polish, loss {first.loss_before:.4g} -> {second.loss:.4g}"
+    assert text in capsys.readouterr().err
+
+
+def test_a_record_holds_the_revised_stages(task, tmp_path):
+    """As the result does; and a copy of the record taken before the polish has the stages as they were found."""
+    recorder = RunRecorder(tmp_path / "run")
+    early = []
+
+    class Copy(Observer):
+        def part_started(self, stage, part):
+            if part == PHASE and not early:
+                early.append(load_record(tmp_path / "run").stages)
+
+    with recorder:
+        result = sculpted(task, observers=(recorder, Copy()))
+    record = load_record(tmp_path / "run")
+    for stage, kept in zip(result.stages, record.stages, strict=True):
+        assert torch.equal(kept.actions, stage.actions)
+        assert torch.equal(kept.state.position, stage.state.position)
+        assert (kept.loss, kept.loss_before) == (stage.loss, stage.loss_before)
+        assert kept.gradient_evaluations == stage.gradient_evaluations
+    assert [stage.index for stage in early[0]] == [0, 1]
+    assert record.stages[1].loss < early[0][1].loss
+    revisions = [line for line in record.metrics if line["kind"] == "revision"]
+    assert [(line["stage"], line["stages"]) for line in revisions] == [(1, 2), (2, 1)]
+    assert revisions[0]["loss"] == record.stages[1].loss
+    assert record.run["stages_finished"] == 3
 
 
 def test_memory_of_the_chain_is_given_back_by_its_simulator(task):

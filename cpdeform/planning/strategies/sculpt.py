@@ -15,6 +15,7 @@ from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
 from cpdeform.planning.coarse import CoarseModel
 from cpdeform.planning.interrupted import StageInterrupted, StagesInterrupted
+from cpdeform.planning.joint import PHASE as JOINT_POLISH
 from cpdeform.planning.joint import polish_jointly
 from cpdeform.planning.objectives.shape import ObjectiveShape
 from cpdeform.planning.optimizer import TrajectoryOptimizer
@@ -24,7 +25,7 @@ from cpdeform.planning.phases.screening import PhaseScreening
 from cpdeform.planning.phases.trial import PhaseTrial
 from cpdeform.planning.pruner import PrunerNone
 from cpdeform.planning.rest import rest, settle_goal
-from cpdeform.planning.result import StageResult, Status
+from cpdeform.planning.result import Revision, StageResult, Status
 from cpdeform.planning.strategy import Parts, Strategy
 
 MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
@@ -45,15 +46,15 @@ class StrategySculpt(Strategy):
     are drawn, a few times in a row.
 
     A touch that is planned alone serves its own loss. Once a few are found, one descent lowers the loss at their end over the
-    actions of all (`cpdeform.planning.joint`), as far as the simulator's gradients can be chained; only then are these stages
-    final.
+    actions of all (`cpdeform.planning.joint`), as far as the simulator's gradients can be chained: these stages are then given once
+    more, revised.
 
     Args:
         touches: Random touches of a stage.
         variations: Touches of each of two rounds of variations.
         polished: Candidates of the first step of polishing, and of the second.
         iterations: Gradient evaluations of each of them in these steps.
-        together: Stages that are polished together, before any of them is final.
+        together: Stages that are polished together.
         joint_iterations: Gradient evaluations of each of them in that.
         joint_every: Stages after which those found so far are polished together on the way.
         interim_iterations: Gradient evaluations of each of them in that.
@@ -116,7 +117,7 @@ class StrategySculpt(Strategy):
             ),
         )
 
-    def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
+    def loop(self, planner: Planner, start: Start) -> Iterator[StageResult | Revision]:
         """One touch a stage, from rest to rest, some polished together; a few stages without a gain do not end the run."""
         planner, start = from_rest(planner, start)
         if self.coarse:
@@ -124,34 +125,41 @@ class StrategySculpt(Strategy):
         finished: list[StageResult] = []
         end = start.first_stage + start.stages
         for first in range(start.first_stage, end, self.together):
-            found: list[StageResult] = []
+            held: list[StageResult] = []
             stages = range(first, min(first + self.together, end))
-            try:
-                for part in _parts(stages, self.joint_every):
-                    for result in self._touches(planner, start, part, [*finished, *found]):
-                        found.append(result)
-                    over = self._is_over([*finished, *found])
-                    if takes_final_gradient(planner.simulator):
-                        last = over or part[-1] == stages[-1]
-                        found = polish_jointly(planner, found, self._joint if last else self._interim)
-                    if over:
-                        break
-            except KeyboardInterrupt as interruption:
-                yield from interruption.results if isinstance(interruption, StagesInterrupted) else found
-                if isinstance(interruption, StageInterrupted):
-                    yield interruption.result
-                raise
-            yield from found
-            finished += found
-            if self._is_over(finished):
-                return
+            for part in _parts(stages, self.joint_every):
+                for result in self._touches(planner, start, part, [*finished, *held]):
+                    held.append(result)
+                    yield result
+                over = self._is_over([*finished, *held])
+                last = over or part[-1] == stages[-1]
+                for revision in self._polished(planner, held, self._joint if last else self._interim):
+                    held = list(revision.results)
+                    yield revision
+                if over:
+                    return
+            finished += held
+
+    def _polished(self, planner: Planner, held: list[StageResult], optimizer: TrajectoryOptimizer) -> Iterator[Revision]:
+        """The stages polished together, where the simulator can; nothing where no stage has a plan."""
+        if not takes_final_gradient(planner.simulator) or all(result.actions is None for result in held):
+            return
+        try:
+            yield Revision(tuple(polish_jointly(planner, held, optimizer)), JOINT_POLISH)
+        except StagesInterrupted as interruption:
+            yield Revision(interruption.results, JOINT_POLISH)
+            raise
 
     def _touches(self, planner: Planner, start: Start, stages: range, finished: Sequence[StageResult]) -> Iterator[StageResult]:
-        """Stages one after the other, each by itself."""
+        """Stages one after the other, each by itself; an interrupted one, too, before the interruption goes on."""
         before = list(finished)
         for index in stages:
             state, warm = (before[-1].state, before[-1].warm) if before else (start.state, None)
-            before.append(planner.stage(start, index, state, before, warm=warm))
+            try:
+                before.append(planner.stage(start, index, state, before, warm=warm))
+            except StageInterrupted as interruption:
+                yield interruption.result
+                raise
             yield before[-1]
             if self._is_over(before):
                 return
