@@ -1,0 +1,25 @@
+"""References of docstrings as plain text: several docstrings on a page may each have a reference [1]."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from sphinx.application import Sphinx
+
+BEFORE_NAPOLEON = 400
+DEFINITION = re.compile(r"^(\s*)\.\. \[(\d+)\] ")
+CITATION = re.compile(r"\[(\d+)\]_")
+
+
+def plain_references(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Turn numbered footnotes of a docstring into list items, and what cites them into text."""
+    for number, line in enumerate(lines):
+        item = DEFINITION.sub(r"\1* \\[\2] ", line)
+        lines[number] = CITATION.sub(r"[\1]", item)
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register with Sphinx."""
+    app.connect("autodoc-process-docstring", plain_references, priority=BEFORE_NAPOLEON)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
