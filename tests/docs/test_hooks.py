@@ -113,7 +113,14 @@ def test_a_run_with_these_parts_lowers_the_loss_and_tells_the_observers(
     small = {"strategy_options": {"iterations": 5}, "priorities": {"blur": 0.02}, "objective": {"points": 40, "blur": 0.02}}
     with caplog.at_level(logging.INFO, logger="my_package"):
         result = deform(
-            "nudge", simulator="sketch", ot_solver="dense", placer="above", strategy="patient", stages=1, settings=small, registry=registry
+            "nudge",
+            simulator="sketch",
+            ot_solver="dense",
+            placer="above",
+            strategy="patient",
+            stages=1,
+            settings=small,
+            registry=registry,
         )
     assert result.loss_final < 0.8 * result.loss_initial
     assert result.configuration.optimizer.patience == 30
