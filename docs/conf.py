@@ -24,7 +24,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
-    "footnotes",
+    "docstrings",
     "repository_links",
 ]
 exclude_patterns = ["_build", "_extensions"]

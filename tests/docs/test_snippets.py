@@ -18,19 +18,23 @@ ELSEWHERE = {DOCS / "hooks.md", *(page for page in READMES if page.parent.name =
 
 PAGES = [page for page in pages() if page not in ELSEWHERE and blocks(page, "python")]
 
+FEW = "scene.bodies.0.particle_count=300"
 SMALLER = {
-    "run": ["--iterations", "1", "--set", "scene.bodies.0.particle_count=300"],
+    "run": ["--iterations", "1", "--no-pictures", "--set", "objective.points=300", "--set", FEW, "--steps", "3"],
     "report": ["--losers", "0", "--no-evaluate"],
     "task new": ["--particles", "400"],
 }
 """What is added to a command that is run."""
 
 SHORTER = {
-    "--strategy sculpt --stages 6": "--strategy sculpt --stages 1 --set strategy_options.touches=2 --set strategy_options.variations=1"
-    " --set strategy_options.joint_iterations=1",
     "subdivisions=3": "subdivisions=2",
     "step_count=10, stage_count=1)": "step_count=2, stage_count=1)",
-    "deform(task, seed=0)": "deform(task, seed=0, settings={'optimizer': {'iterations': 1}, 'objective': {'points': 300}})",
+    'load_task("pinch").scene\n': """load_task("pinch").scene
+scene = scene.model_copy(update={"bodies": (scene.bodies[0].model_copy(update={"particle_count": 300}),)})
+""",
+    "deform(task, seed=0)": 'deform(task, seed=0, settings={"optimizer": {"iterations": 1}})',
+    '{"iterations": 3}}': '{"iterations": 1}, "objective": {"points": 300}, "priorities": {"blur": 0.02}}',
+    'few = {"scene"': 'few = {"objective": {"points": 300}, "scene"',
 }
 """Parts of snippets and commands, and what takes their place."""
 
@@ -45,8 +49,8 @@ def run_command(line: str) -> None:
     """Run a command of cpdeform in this process."""
     words = shlex.split(shortened(line))[1:]
     extra = SMALLER.get(words[0]) or SMALLER.get(" ".join(words[:2])) or []
-    if "--resume" in words or words[1:2] == ["pebble.yaml"]:
-        extra = extra[:2]
+    if "--resume" in words:
+        extra = extra[:5]  # the record says how many particles there are
     with warnings.catch_warnings():
         warnings.simplefilter("default")  # the command line prints warnings
         result = CliRunner().invoke(app, [*words, *extra])

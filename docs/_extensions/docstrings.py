@@ -1,4 +1,7 @@
-"""References of docstrings as plain text: several docstrings on a page may each have a reference [1]."""
+"""Docstrings that people read in an editor, made fit for reStructuredText.
+
+Several docstrings on a page may each have a reference [1], and a bar is the absolute value of something, not a substitution.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,16 @@ from sphinx.application import Sphinx
 
 BEFORE_NAPOLEON = 400
 DEFINITION = re.compile(r"^(\s*)\.\. \[(\d+)\] ")
+BAR = re.compile(r"(`+[^`]*`+)|\|")
 CITATION = re.compile(r"\[(\d+)\]_")
 
 
 def plain_references(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
-    """Turn numbered footnotes of a docstring into list items, and what cites them into text."""
+    """Turn numbered footnotes of a docstring into list items, what cites them into text, and bars into bars."""
     for number, line in enumerate(lines):
         item = DEFINITION.sub(r"\1* \\[\2] ", line)
-        lines[number] = CITATION.sub(r"[\1]", item)
+        plain = CITATION.sub(r"[\1]", item)
+        lines[number] = BAR.sub(lambda match: match[1] or "\\|", plain)
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
