@@ -16,9 +16,13 @@ from sphinx.application import Sphinx
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 LINK = re.compile(r"(?P<image>!?)\[(?P<text>(?:[^\[\]]|`[^`]*`)*)\]\((?P<target>[^()\s#]+)(?P<anchor>#[^()\s]*)?\)")
-PAGES = {ROOT / "README.md": DOCS / "index.md", ROOT / "CONTRIBUTING.md": DOCS / "contributing.md"} | {
-    ROOT / "plugins" / f"cpdeform-{name}" / "README.md": DOCS / "plugins" / f"{name}.md"
-    for name in ("example", "native", "gymnasium", "baselines")
+PAGES = {
+    ROOT / "README.md": DOCS / "index.md",
+    **{ROOT / f"{name.upper()}.md": DOCS / f"{name}.md" for name in ("contributing", "security", "changelog")},
+    **{
+        ROOT / "plugins" / f"cpdeform-{name}" / "README.md": DOCS / "plugins" / f"{name}.md"
+        for name in ("example", "native", "gymnasium", "baselines")
+    },
 }
 """Files of the repository that are pages of the site."""
 
