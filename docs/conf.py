@@ -20,11 +20,11 @@ version = release
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "docstrings",
+    "mathml",
     "repository_links",
 ]
 exclude_patterns = ["_build", "_extensions"]
@@ -47,6 +47,7 @@ napoleon_use_rtype = False
 copybutton_prompt_text = "$ "
 copybutton_only_copy_prompt_lines = True
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"cpdeform {release}"
 html_static_path = ["_static"]

@@ -1,6 +1,6 @@
 """A placer and a strategy of your own, tried without packaging anything: `deform` takes objects where it takes names.
 
-The placer presses on the clay where it is highest above the goal. The strategy gives it a budget, and varies the best plan at random
+The placer presses on the clay where it is highest above the goal. The strategy gives it a budget and varies the best plan at random
 before it is executed. Run it with ``python examples/own_parts.py``.
 """
 
@@ -116,10 +116,10 @@ class StrategyShaken(Strategy):
 
 
 def plan(*, iterations: int, stages: int, particles: int) -> RunResult:
-    """Plan for `pinch` with the two."""
+    """Plan for `writer-v2` with the two."""
     few = {"scene": {"bodies": {"0": {"particle_count": particles}}}}
     return deform(
-        "pinch", placer=PlacerExcess(), strategy=StrategyShaken(iterations=iterations), stages=stages, settings=few, seed=0
+        "writer-v2", placer=PlacerExcess(), strategy=StrategyShaken(iterations=iterations), stages=stages, settings=few, seed=0
     )
 
 
@@ -127,7 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Plan, and print which proposals won."""
     parser = argparse.ArgumentParser(description="Plan with a placer and a strategy of your own.")
     parser.add_argument("--iterations", type=int, default=12)
-    parser.add_argument("--stages", type=int, default=2)
+    parser.add_argument("--stages", type=int, default=1)
     parser.add_argument("--particles", type=int, default=6000)
     options = parser.parse_args(arguments)
     result = plan(iterations=options.iterations, stages=options.stages, particles=options.particles)
