@@ -105,10 +105,12 @@ def experiment(
     ] = False,
     workers: Annotated[
         int | None,
-        typer.Option(help="Runs at the same time, each with its share of the cores.  [default: one, with all]", metavar="N"),
+        typer.Option(
+            help="Runs at the same time, each with its share of the cores. Defaults to one run with all cores.", metavar="N"
+        ),
     ] = None,
     engine: Annotated[
-        str | None, typer.Option(help="Where they run: local, ray or slurm.  [default: this process]", metavar="NAME")
+        str | None, typer.Option(help="Where they run: local, ray or slurm. Defaults to this process.", metavar="NAME")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line.")] = False,
 ) -> None:

@@ -32,7 +32,7 @@ Directory = Annotated[Path, typer.Argument(help="Directory of the sweep.", metav
 def work_command(
     directory: Directory,
     workers: Annotated[
-        int | None, typer.Option(help="Workers at the same time.  [default: as many as there is room for]", metavar="N")
+        int | None, typer.Option(help="Workers at the same time. Defaults to as many as there is room for.", metavar="N")
     ] = None,
     shard: Annotated[
         str | None, typer.Option(help="Do only part i of n of the jobs, i from 0: for arrays of jobs.", metavar="I/N")
