@@ -31,7 +31,7 @@ def new_command(
         int | None, typer.Option(help="Largest number of gradient steps per stage. Defaults to what fits the task.")
     ] = None,
     stages: Annotated[int | None, typer.Option(help="Number of stages. Defaults to the task's.")] = None,
-    strategy: Annotated[str | None, typer.Option(help="How the search goes. Defaults to cpdeform.", metavar="NAME")] = None,
+    strategy: Annotated[str | None, typer.Option(help="How to search. Defaults to cpdeform.", metavar="NAME")] = None,
     backend: Annotated[str | None, typer.Option(help="Simulator. Defaults to the fastest installed.", metavar="NAME")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the plans.")] = 0,
     threads: Annotated[int, typer.Option(help="Threads of each plan.")] = 1,
@@ -50,7 +50,7 @@ def new_command(
 ) -> None:
     """Plan for generated goals and write NAME/dataset: ManiSkill's layout, a Minari data set, checksums and a card.
 
-    The same command goes on where it was broken off, and plans what is new with more goals. `cpdeform sweep work NAME` lets other
+    The same command continues where it stopped, and plans for new goals if there are more. `cpdeform sweep work NAME` lets other
     machines help. Exit code 0: there is a data set; 1: no goal has a plan; 2: unusable input.
     """
     from cpdeform.cli.sweep import work_on
