@@ -5,6 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 NATIVE := $(VENV)/.native
+DOCUMENTED := $(VENV)/.docs
 NATIVE_SOURCES := $(shell find plugins/cpdeform-native -name '*.cpp' -o -name '*.h' -o -name CMakeLists.txt -o -name pyproject.toml)
 COMPILER := $(shell command -v $${CXX:-c++} 2>/dev/null)
 OUT ?= runs/first
@@ -14,7 +15,7 @@ PYTEST := python -m pytest -n $(WORKERS) --dist loadfile
 
 SANITIZED := plugins/cpdeform-native/build/sanitized
 
-.PHONY: run test quick faults sweeps lint goals pictures sanitize clean
+.PHONY: run test quick faults sweeps lint docs goals pictures sanitize clean
 
 run: $(NATIVE)
 	$(BIN)/cpdeform run writer --out $(OUT) --overwrite
@@ -49,6 +50,11 @@ lint: $(INSTALLED)
 	cd plugins/cpdeform-baselines && ../../$(BIN)/mypy
 	cd plugins/cpdeform-native && ../../$(BIN)/mypy
 
+# The documentation as a site, in docs/_build/html. A warning is an error; nothing is fetched but the packages that build it.
+docs: $(DOCUMENTED)
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --builder html docs docs/_build/html
+	@echo "The documentation is in docs/_build/html/index.html"
+
 # All 53 take two minutes with the native simulator, which is why it is built first; six times as long with Warp.
 # `make goals GOALS="star move-v2"` checks some of them.
 GOALS ?=
@@ -81,6 +87,10 @@ $(INSTALLED): pyproject.toml constraints.txt plugins/cpdeform-gymnasium/pyprojec
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-deps --editable plugins/cpdeform-example
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable plugins/cpdeform-gymnasium --editable plugins/cpdeform-baselines
 	touch $(INSTALLED)
+
+$(DOCUMENTED): $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	touch $(DOCUMENTED)
 
 # The C++ simulator and transport solver. Without a compiler the other backends take their place.
 $(NATIVE): $(INSTALLED) $(NATIVE_SOURCES)

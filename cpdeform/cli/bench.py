@@ -43,7 +43,7 @@ SIMULATOR_COLUMNS: Mapping[str, tuple[str, str]] = {
 
 SIMULATOR_NOTE = (
     "Times are for one substep of all worlds of the row together, medians. Peak: above the process before the simulator was built; "
-    "rollout: a rollout and its gradient, which is what the estimate foretells. MB are 1e6 bytes."
+    "rollout: a rollout and its gradient, which is what the estimate predicts. MB are 1e6 bytes."
 )
 
 

@@ -40,7 +40,7 @@ def bench_run_command(
     seeds: Annotated[str, typer.Option(help="Seeds, separated by commas.")] = "0",
     threads: Annotated[int | None, typer.Option(help="Threads. Defaults to the cores at hand.")] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.", metavar="NAME")] = "cpu",
-    iterations: Annotated[int, typer.Option(help="The most gradient steps per stage.")] = 30,
+    iterations: Annotated[int, typer.Option(help="Largest number of gradient steps per stage.")] = 30,
     stages: Annotated[int | None, typer.Option(help="Number of stages. Defaults to the task's.")] = None,
     timeout: Annotated[float, typer.Option(help="Seconds after which a run is given up.")] = 3600.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line.")] = False,

@@ -27,10 +27,12 @@ def new_command(
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="Any option of `cpdeform run`; repeatable.", metavar="KEY=VALUE")
     ] = None,
-    iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: by the task]")] = None,
-    stages: Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")] = None,
-    strategy: Annotated[str | None, typer.Option(help="How the search goes.  [default: cpdeform]", metavar="NAME")] = None,
-    backend: Annotated[str | None, typer.Option(help="Simulator.  [default: the fastest installed]", metavar="NAME")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(help="Largest number of gradient steps per stage. Defaults to what fits the task.")
+    ] = None,
+    stages: Annotated[int | None, typer.Option(help="Number of stages. Defaults to the task's.")] = None,
+    strategy: Annotated[str | None, typer.Option(help="How to search. Defaults to cpdeform.", metavar="NAME")] = None,
+    backend: Annotated[str | None, typer.Option(help="Simulator. Defaults to the fastest installed.", metavar="NAME")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the plans.")] = 0,
     threads: Annotated[int, typer.Option(help="Threads of each plan.")] = 1,
     particles: Annotated[int, typer.Option(help="Particles of an observation.")] = 1000,
@@ -38,7 +40,7 @@ def new_command(
     shard_size: Annotated[int, typer.Option(help="Episodes of a file.")] = 100,
     licence: Annotated[str, typer.Option(help="Licence of the data, an SPDX identifier.", metavar="NAME")] = "CC-BY-4.0",
     workers: Annotated[
-        int | None, typer.Option(help="Workers at the same time.  [default: as many as there is room for]", metavar="N")
+        int | None, typer.Option(help="Workers at the same time. Defaults to as many as there is room for.", metavar="N")
     ] = None,
     engine: Annotated[str, typer.Option(help="Where workers run: local, ray or slurm.", metavar="NAME")] = "local",
     no_work: Annotated[
@@ -48,7 +50,7 @@ def new_command(
 ) -> None:
     """Plan for generated goals and write NAME/dataset: ManiSkill's layout, a Minari data set, checksums and a card.
 
-    The same command goes on where it was broken off, and plans what is new with more goals. `cpdeform sweep work NAME` lets other
+    The same command continues where it stopped, and plans for new goals if there are more. `cpdeform sweep work NAME` lets other
     machines help. Exit code 0: there is a data set; 1: no goal has a plan; 2: unusable input.
     """
     from cpdeform.cli.sweep import work_on
@@ -90,8 +92,8 @@ def new_command(
 @dataset.command("replay")
 def replay_command(
     directory: Annotated[Path, typer.Argument(help="Data set, or the directory that it was made in.", metavar="DIR")],
-    episodes: Annotated[str | None, typer.Option(help="Numbers and ranges FIRST:END.  [default: all]", metavar="NUMBERS")] = None,
-    backend: Annotated[str | None, typer.Option(help="Simulator.  [default: that of the data set]", metavar="NAME")] = None,
+    episodes: Annotated[str | None, typer.Option(help="Numbers and ranges FIRST:END. Defaults to all.", metavar="NUMBERS")] = None,
+    backend: Annotated[str | None, typer.Option(help="Simulator. Defaults to that of the data set.", metavar="NAME")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Simulate episodes again and compare where they end.

@@ -64,7 +64,9 @@ def experiment(
         ),
     ] = None,
     seeds: Annotated[str | None, typer.Option(help="Seeds, separated by commas. Defaults to 0.", metavar="NUMBERS")] = None,
-    iterations: Annotated[int | None, typer.Option(help="The most gradient steps a stage. Defaults to the task's, or 40.")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(help="Largest number of gradient steps per stage. Defaults to the task's, or 40.")
+    ] = None,
     stages: Annotated[int | None, typer.Option(help="Number of stages. Defaults to the task's.")] = None,
     particles: Annotated[
         int | None, typer.Option(help="Particles of all bodies together; goals stay as they are. Defaults to the task's.")
@@ -98,17 +100,19 @@ def experiment(
     ] = None,
     resume: Annotated[
         bool,
-        typer.Option("--resume/--no-resume", help="Read runs that are recorded with the same configuration instead of running."),
+        typer.Option("--resume/--no-resume", help="Read recorded runs of the same configuration instead of running them again."),
     ] = True,
     no_run: Annotated[
-        bool, typer.Option("--no-run", help="Run nothing; make the tables anew of all records in --out, or of those asked for.")
+        bool, typer.Option("--no-run", help="Run nothing; make the tables of all records in --out, or of the chosen ones.")
     ] = False,
     workers: Annotated[
         int | None,
-        typer.Option(help="Runs at the same time, each with its share of the cores.  [default: one, with all]", metavar="N"),
+        typer.Option(
+            help="Runs at the same time, each with its share of the cores. Defaults to one run with all cores.", metavar="N"
+        ),
     ] = None,
     engine: Annotated[
-        str | None, typer.Option(help="Where they run: local, ray or slurm.  [default: this process]", metavar="NAME")
+        str | None, typer.Option(help="Where they run: local, ray or slurm. Defaults to this process.", metavar="NAME")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line.")] = False,
 ) -> None:

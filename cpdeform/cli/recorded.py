@@ -15,7 +15,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 def config(
     directory: Record,
-    origin: Annotated[bool, typer.Option("--origin", help="Say of each value where it comes from.")] = False,
+    origin: Annotated[bool, typer.Option("--origin", help="Print where each value comes from.")] = False,
     command: Annotated[bool, typer.Option("--command", help="Print the command that repeats the run instead.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -66,7 +66,7 @@ def replay(
     device: Annotated[str | None, typer.Option(help="cpu or cuda. Defaults to the record's.", metavar="NAME")] = None,
     as_json: Json = False,
 ) -> None:
-    """Repeat the plans that a run found, and tell how far the clay ends from where the record has it.
+    """Repeat the plans that a run found, and print how far the clay ends from where the record has it.
 
     Each stage is repeated from the recorded state, and, chained, from where the repetition of the stage before ended.
 

@@ -14,7 +14,7 @@ Record = Annotated[Path, typer.Argument(help="A run record, see `cpdeform run --
 def report(
     directory: Record,
     out: Annotated[Path | None, typer.Option(help="The HTML file. Defaults to report.html in the record.", metavar="FILE")] = None,
-    losers: Annotated[int, typer.Option(help="Candidates of each stage that lost, to be rolled out again; 0 for none.", min=0)] = 2,
+    losers: Annotated[int, typer.Option(help="Losing candidates of each stage to roll out again; 0 for none.", min=0)] = 2,
     evaluate: Annotated[
         bool, typer.Option("--evaluate/--no-evaluate", help="Compute the figures of `cpdeform evaluate` (half a minute).")
     ] = True,
@@ -69,9 +69,9 @@ def view(
     port: Annotated[int, typer.Option(help="Port on this machine; 0 for any free one.", min=0, max=65535)] = 0,
     show: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
 ) -> None:
-    """Serve the page of a run while it goes on; stages appear as they are done. Only this machine is answered.
+    """Serve the page of a run while it goes on; stages appear as they are done. Only requests from this machine are answered.
 
-    The directory may come into being later. Control-C ends it.
+    The directory may appear later. Control-C ends it.
 
     Examples:
       cpdeform run star --out runs/star & cpdeform view runs/star --open

@@ -34,14 +34,14 @@ REPLACED = {
 
 
 def run(
-    task: Annotated[str | None, typer.Argument(help="Name, e.g. writer-v2, or a YAML file. Defaults to writer.")] = None,
+    task: Annotated[str | None, typer.Argument(help="Name of a task, e.g. writer-v2, or a YAML file. Defaults to writer.")] = None,
     backend: Annotated[
         str | None, typer.Option(help="Simulator; auto: the fastest installed. Defaults to auto.", metavar="NAME")
     ] = None,
     ot: Annotated[str | None, typer.Option(help="Optimal-transport solver. Defaults to auto.", metavar="NAME")] = None,
     placer: Annotated[str | None, typer.Option(help="Where tools are put. Defaults to transport.", metavar="NAME")] = None,
     strategy: Annotated[
-        str | None, typer.Option(help="How the search goes, see `cpdeform strategies`. Defaults to cpdeform.", metavar="NAME")
+        str | None, typer.Option(help="How to search, see `cpdeform strategies`. Defaults to cpdeform.", metavar="NAME")
     ] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda. Defaults to cpu.", metavar="NAME")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of first actions and random placements. Defaults to 0.")] = None,
@@ -51,7 +51,7 @@ def run(
         Path | None, typer.Option(help="Goal file instead of the task's own, see `cpdeform task import-grid`.", metavar="FILE")
     ] = None,
     iterations: Annotated[
-        int | None, typer.Option(help="The most gradient steps per stage. Defaults to what fits the task.")
+        int | None, typer.Option(help="Largest number of gradient steps per stage. Defaults to what fits the task.")
     ] = None,
     workers: Annotated[
         int | None, typer.Option(help="Processes that the candidates of a stage are spread over. Defaults to 1.", metavar="N")
@@ -62,7 +62,10 @@ def run(
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option(help="Go on from this run record: its last state, its task, its options under those given.", metavar="DIR"),
+        typer.Option(
+            help="Continue this run record: its last state and its task. Options given here override the recorded ones.",
+            metavar="DIR",
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Directory of the run record. Defaults to runs/<task>-<time>.", metavar="DIR")
@@ -70,7 +73,7 @@ def run(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run record in --out.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line, no progress.")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Run nothing; print the configuration with all that was left open, as YAML or JSON.")
+        bool, typer.Option("--dry-run", help="Run nothing; print the full configuration, defaults included, as YAML or JSON.")
     ] = False,
     no_pictures: Annotated[bool, typer.Option("--no-pictures", help="Draw no picture and no animation.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,

@@ -32,7 +32,7 @@ Directory = Annotated[Path, typer.Argument(help="Directory of the sweep.", metav
 def work_command(
     directory: Directory,
     workers: Annotated[
-        int | None, typer.Option(help="Workers at the same time.  [default: as many as there is room for]", metavar="N")
+        int | None, typer.Option(help="Workers at the same time. Defaults to as many as there is room for.", metavar="N")
     ] = None,
     shard: Annotated[
         str | None, typer.Option(help="Do only part i of n of the jobs, i from 0: for arrays of jobs.", metavar="I/N")
@@ -44,17 +44,17 @@ def work_command(
         typer.Option("--set", help="Any other option of the engine, e.g. memory_gb=4; repeatable.", metavar="KEY=VALUE"),
     ] = None,
     stale_after: Annotated[
-        float, typer.Option(help="Without a heartbeat for so long, a worker counts as dead.", metavar="SECONDS")
+        float, typer.Option(help="A worker without a heartbeat for this long counts as dead.", metavar="SECONDS")
     ] = 60.0,
     attempts: Annotated[int, typer.Option(help="Workers that may die on a job before it counts as failed.", metavar="N")] = 5,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line.")] = False,
 ) -> None:
     """Do the jobs of a sweep until none is left; any number of these commands may work on the same directory.
 
-    A job whose worker dies goes back to the others. What comes of a job does not depend on who does it.
+    The job of a worker that dies goes back into the queue. The result of a job does not depend on the worker.
 
-    Exit code 0: all jobs are over and one is done; 1: none is done; 2: unusable input; 130, 143: interrupted (jobs in hand are
-    given back, and go on after their last finished stage).
+    Exit code 0: all jobs are over and one is done; 1: none is done; 2: unusable input; 130, 143: interrupted (running jobs
+    go back into the queue, and continue after their last finished stage).
     """
     from cpdeform.core.plugins import load_registry, split_options
     from cpdeform.sweep.queue import Queue
@@ -73,11 +73,11 @@ def work_command(
 def status_command(
     directory: Directory,
     stale_after: Annotated[
-        float, typer.Option(help="Without a heartbeat for so long, a worker counts as dead.", metavar="SECONDS")
+        float, typer.Option(help="A worker without a heartbeat for this long counts as dead.", metavar="SECONDS")
     ] = 60.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Say how far a sweep is, and why jobs failed."""
+    """Print the progress of a sweep, and why jobs failed."""
     from cpdeform.sweep.queue import FAILED, Queue
     from cpdeform.sweep.status import sweep_status
 

@@ -25,10 +25,12 @@ def new_command(
             help="An option with several values, runs for each; repeatable, then for every combination.", metavar="KEY=VALUE,..."
         ),
     ] = None,
-    iterations: Annotated[int | None, typer.Option(help="The most gradient steps per stage.  [default: by the task]")] = None,
-    stages: Annotated[int | None, typer.Option(help="Number of stages.  [default: the task's]")] = None,
-    backend: Annotated[str | None, typer.Option(help="Simulator.  [default: the fastest installed]", metavar="NAME")] = None,
-    ot: Annotated[str | None, typer.Option(help="Optimal-transport solver.  [default: the fastest]", metavar="NAME")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(help="Largest number of gradient steps per stage. Defaults to what fits the task.")
+    ] = None,
+    stages: Annotated[int | None, typer.Option(help="Number of stages. Defaults to the task's.")] = None,
+    backend: Annotated[str | None, typer.Option(help="Simulator. Defaults to the fastest installed.", metavar="NAME")] = None,
+    ot: Annotated[str | None, typer.Option(help="Optimal-transport solver. Defaults to the fastest.", metavar="NAME")] = None,
     threads: Annotated[int, typer.Option(help="Threads of each job.")] = 1,
 ) -> None:
     """Make the jobs of a sweep: every task with every variation and every seed. Nothing is run.

@@ -36,9 +36,9 @@ def import_grid_command(
     file: Annotated[Path, typer.Argument(help="Node masses: a dense .npy or .npz, or a sparse .npz.", metavar="FILE")],
     out: Annotated[Path, typer.Option(help="Goal file to write, .npz; with --all a directory.", metavar="GOAL")],
     task: Annotated[
-        str | None, typer.Option(help="Task whose scene it is for. Defaults to after the grid's name.", metavar="TASK")
+        str | None, typer.Option(help="Task whose scene it is for. Defaults to the task with the grid's name.", metavar="TASK")
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Which grid, where the file holds several.", metavar="NAME")] = None,
+    name: Annotated[str | None, typer.Option(help="Which grid, if the file holds several.", metavar="NAME")] = None,
     particles: Annotated[int | None, typer.Option(help="Number of particles. Defaults to the body's.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the sample.")] = 0,
     every: Annotated[bool, typer.Option("--all", help="Import all grids that a task is known for: GOAL/<task>.npz.")] = False,
@@ -46,7 +46,7 @@ def import_grid_command(
 ) -> None:
     """Turn a target grid of PlasticineLab into a goal file for `cpdeform run TASK --goal GOAL`.
 
-    The goal's particles are an even sample whose own node masses are the grid's; the file keeps the grid, too.
+    The goal's particles are an even sample whose own node masses are the grid's; the file also keeps the grid.
     """
     from cpdeform.core.bounded import MOST_SEED
     from cpdeform.core.errors import InputError

@@ -15,9 +15,9 @@ def task_check_command(
     ],
     as_json: Annotated[bool, typer.Option("--json", help="Print one object as the last line.")] = False,
 ) -> None:
-    """Tell of tools that clay passes through, bodies that stick, and goals that cannot be reached.
+    """Report tools that clay passes through, bodies that stick, and goals that cannot be reached.
 
-    Errors and warnings are faults of the task: with one of them the exit status is 1. Notes are right if they are meant.
+    Errors and warnings are faults of the task: with one of them the exit status is 1. Notes may be intended.
     """
     from cpdeform.core.task import load_task
     from cpdeform.run.checks.check import check_task

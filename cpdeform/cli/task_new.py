@@ -14,9 +14,13 @@ def new_command(
         Path,
         typer.Option(help="Shape wanted: a mesh (.stl, .obj, .ply, .glb), or a picture (.png, .jpg) as a relief.", metavar="FILE"),
     ],
-    start: Annotated[Path | None, typer.Option(help="Mesh that the clay starts as; else a block.", metavar="FILE")] = None,
-    tool: Annotated[Path | None, typer.Option(help="Mesh of the tool; else two blocks, or a pen.", metavar="FILE")] = None,
-    up: Annotated[str | None, typer.Option(help="Axis that points upwards in the meshes: x, y or z; else the format's.")] = None,
+    start: Annotated[Path | None, typer.Option(help="Mesh that the clay starts as. Defaults to a block.", metavar="FILE")] = None,
+    tool: Annotated[
+        Path | None, typer.Option(help="Mesh of the tool. Defaults to two blocks, for a picture to a pen.", metavar="FILE")
+    ] = None,
+    up: Annotated[
+        str | None, typer.Option(help="Axis that points upwards in the meshes: x, y or z. Defaults to the format's.")
+    ] = None,
     folder: Annotated[Path, typer.Option(help="Where the files are written.", metavar="DIR")] = Path(),
     particles: Annotated[int, typer.Option(help="Number of particles of clay.")] = 10_000,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,

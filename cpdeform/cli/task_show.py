@@ -10,7 +10,7 @@ import typer
 
 def show_command(
     task: Annotated[str, typer.Argument(help="A task's name or the path of a YAML file.", metavar="TASK")],
-    out: Annotated[Path | None, typer.Option(help="Picture to write, .png.  [default: TASK.png]", metavar="FILE")] = None,
+    out: Annotated[Path | None, typer.Option(help="Picture to write, .png. Defaults to TASK.png.", metavar="FILE")] = None,
 ) -> None:
     """Draw a task: the clay at the start with its tools, and the goal, from two sides."""
     from cpdeform.core.errors import InputError

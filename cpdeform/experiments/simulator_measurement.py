@@ -64,7 +64,7 @@ def measure(request: dict[str, Any]) -> dict[str, Any]:
         ``forward_ms_per_substep`` and ``backward_ms_per_substep`` of all worlds together, medians;
         ``particle_substeps_per_second`` forwards and backwards, all worlds; in megabytes (1e6 bytes) ``peak_memory_mb``
         above what the process held before the simulator was built, ``rollout_memory_mb`` of rollout and gradient above what
-        it held before them, and ``memory_estimate_mb``, which foretells the latter. What cannot be measured is None.
+        it held before them, and ``memory_estimate_mb``, which predicts the latter. What cannot be measured is None.
 
     Raises:
         CpdeformError: The backend cannot do it.

@@ -69,7 +69,7 @@ class Exploration:
         return exploration
 
     def explore(self, contact: int, *, radius: float | None = None) -> None:
-        """Count the surroundings of a particle, within `radius` (length units; the exploration's own if absent), as explored."""
+        """Count the surroundings of a particle, within `radius` (length units; defaults to the exploration's own), as explored."""
         self.explored |= self.near(contact, self.radius if radius is None else radius)
 
     def contact(self, body: int, *, excluded: Tensor | None = None) -> int | None:

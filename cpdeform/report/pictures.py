@@ -226,7 +226,7 @@ def _add_height_bar(figure: Any, axes: NDArray[Any], view: View) -> None:
 
 
 def _shown_stage(record: RunRecord) -> StageResult:
-    """The first stage whose plan was executed, else the first."""
+    """The first stage whose plan was executed, otherwise the first."""
     return next((stage for stage in record.stages if stage.best is not None), record.stages[0])
 
 

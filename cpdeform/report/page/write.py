@@ -42,7 +42,7 @@ def write_page(
         path: The file; defaults to ``report.html`` in the record's directory.
         losers: How many of each stage's candidates that lost are rolled out again, the best ones; a record keeps what they were,
             not where their clay went. 0 for none.
-        evaluate: Whether to compute the figures of `cpdeform evaluate`; else the page shows the recorded metric alone.
+        evaluate: Whether to compute the figures of `cpdeform evaluate`; otherwise the page shows the recorded metric alone.
         told: Is told what takes time.
         registry: Where the record's simulator is looked up; defaults to the installed plugins.
 

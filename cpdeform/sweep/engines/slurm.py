@@ -65,7 +65,7 @@ class EngineSlurm(Engine):
         memory_gb: Memory of each, gigabytes; defaults to the cluster's.
         gpus: GPUs of each.
         slurm: Further parameters, such as ``{"partition": "long", "account": "clay"}``, as submitit has them.
-        wait: Whether to wait for the end of the sweep; else the command ends once the array is submitted.
+        wait: Whether to wait for the end of the sweep; otherwise the command ends once the array is submitted.
 
     Raises:
         InputError: A number is out of range, or `workers` is missing.

@@ -20,22 +20,22 @@ FLAGS = ("task", "algorithm", "steps", "worlds", "episode_steps", "seed", "backe
 def rl(
     task: Annotated[str | None, typer.Argument(help="Name, e.g. writer-v2, or a YAML file.")] = None,
     algorithm: Annotated[
-        str | None, typer.Option(help="sac, ppo, td3, or shac (through the simulator's gradient).  [default: sac]", metavar="NAME")
+        str | None, typer.Option(help="sac, ppo, td3, or shac (through the simulator's gradient). Defaults to sac.", metavar="NAME")
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="Environment steps of all worlds together.  [default: 20000]")] = None,
-    worlds: Annotated[int | None, typer.Option(help="Worlds that are stepped together.  [default: 8]")] = None,
-    episode_steps: Annotated[int | None, typer.Option(help="Steps of an episode.  [default: the task's]")] = None,
+    steps: Annotated[int | None, typer.Option(help="Environment steps of all worlds together. Defaults to 20000.")] = None,
+    worlds: Annotated[int | None, typer.Option(help="Worlds that are stepped together. Defaults to 8.")] = None,
+    episode_steps: Annotated[int | None, typer.Option(help="Steps of an episode. Defaults to the task's.")] = None,
     preset: Annotated[
         str | None,
         typer.Option(help="quick: 2,000 steps; paper: 1,000 episodes of 1,000 steps. Other options override it.", metavar="NAME"),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of policy, exploration and starts.  [default: 0]")] = None,
-    backend: Annotated[str | None, typer.Option(help="Simulator.  [default: auto]", metavar="NAME")] = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda.  [default: cpu]", metavar="NAME")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of policy, exploration and starts. Defaults to 0.")] = None,
+    backend: Annotated[str | None, typer.Option(help="Simulator. Defaults to auto.", metavar="NAME")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda. Defaults to cpu.", metavar="NAME")] = None,
     reward: Annotated[
-        str | None, typer.Option(help="auto, transport (the paper) or plasticinelab.  [default: auto]", metavar="NAME")
+        str | None, typer.Option(help="auto, transport (the paper) or plasticinelab. Defaults to auto.", metavar="NAME")
     ] = None,
-    checkpoint_every: Annotated[int | None, typer.Option(help="Steps between checkpoints.  [default: 5000]")] = None,
+    checkpoint_every: Annotated[int | None, typer.Option(help="Steps between checkpoints. Defaults to 5000.")] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Option of the algorithm, e.g. learning_rate=1e-4; repeatable.", metavar="KEY=VALUE"),
@@ -46,7 +46,7 @@ def rl(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Directory of checkpoints and figures.  [default: rl/<task>-<algorithm>-<seed>]", metavar="DIR"),
+        typer.Option(help="Directory of checkpoints and figures. Defaults to rl/<task>-<algorithm>-<seed>.", metavar="DIR"),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line.")] = False,
 ) -> None:
