@@ -123,7 +123,7 @@ class ToolMesh(ToolBase):
     @property
     def kernel_grid(self) -> Array:
         """See `ToolBase`."""
-        return self.grid.coefficients
+        return self.grid.kernel_numbers
 
 
 class BodyMesh(BodyBase):
