@@ -14,6 +14,7 @@ from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
 from cpdeform.planning.coarse import CoarseModel
+from cpdeform.planning.effort import Effort
 from cpdeform.planning.interrupted import StageInterrupted, StagesInterrupted
 from cpdeform.planning.joint import polish_jointly
 from cpdeform.planning.objectives.shape import ObjectiveShape
@@ -105,6 +106,10 @@ class StrategySculpt(Strategy):
                 for number, (keep, optimizer) in enumerate(optimizers)
             ),
         )
+
+    def effort(self, stage: Effort) -> Effort:
+        """See `Strategy`; each stage has a part in a joint descent, too."""
+        return stage + Effort(gradients=(0, self._joint.iterations))
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
         """One touch a stage, from rest to rest, some polished together; a few stages without a gain do not end the run."""
