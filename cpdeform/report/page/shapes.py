@@ -101,8 +101,8 @@ def _fewer(vertices: Array, triangles: NDArray[np.int64], shape: Shape) -> tuple
     from skimage.measure import marching_cubes
 
     grid = shape.grid
-    # Faces turned by the order of the axes: outwards is where the distance grows.
-    found, faces = marching_cubes(grid.distance, 0.0, step_size=2, gradient_direction="ascent")[:2]
+    # Its sides are turned outwards, to where the distance grows.
+    found, faces = marching_cubes(grid.distance, 0.0, step_size=2, gradient_direction="descent")[:2]
     return (found - 0.5 * (np.array(grid.distance.shape) - 1)) * grid.spacing, faces.astype(np.int64)
 
 
