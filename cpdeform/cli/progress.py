@@ -81,10 +81,6 @@ class Starting(Observer):
     def __init__(self, begin: Callable[[], None]) -> None:
         self._begin = begin
 
-    def _left_text(self) -> str:
-        left = None if self._time is None else self._time.seconds()
-        return "" if left is None else f"about {duration(left)} left"
-
     def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
         """Do it."""
         self._begin()
@@ -138,6 +134,10 @@ class ProgressBar(Progress):
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._progress.stop()
+
+    def _left_text(self) -> str:
+        left = None if self._time is None else self._time.seconds()
+        return "" if left is None else f"about {duration(left)} left"
 
     def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
         """Learn the number of stages."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 
@@ -63,12 +64,12 @@ class RunEstimate:
     @property
     def stage_seconds(self) -> float:
         """Wall time of a stage, in the middle (of the two bounds, the geometric one)."""
-        return (self.seconds[0] * self.seconds[1]) ** 0.5 / self.stages
+        return math.sqrt(self.seconds[0] * self.seconds[1]) / self.stages
 
     @property
     def stage_gradients(self) -> float:
         """Gradients of a stage, in the middle; at least one."""
-        return max(1.0, (max(1, self.effort.gradients[0]) * self.effort.gradients[1]) ** 0.5)
+        return max(1.0, math.sqrt(max(1, self.effort.gradients[0]) * self.effort.gradients[1]))
 
 
 def stage_effort(planner: Planner) -> Effort:
