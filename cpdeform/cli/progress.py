@@ -16,20 +16,53 @@ from torch import Tensor
 from cpdeform.core.task import Task
 from cpdeform.planning.optimizer import SEARCH, Iteration
 from cpdeform.planning.result import Observer, Revision, StageResult
+from cpdeform.run.estimate import RunEstimate
+from cpdeform.run.time_left import TimeLeft, duration, duration_range
 
 SECONDS_BETWEEN_LINES = 15.0
 
 
 class Progress(Observer):
-    """What bar and lines have in common: the number of the batch, and the memory that rollouts are about to need."""
+    """What bar and lines have in common: the number of the batch, the memory that rollouts are about to need, and the time left."""
 
     _told = 0
     _batch = 0
+    _time: TimeLeft | None = None
+
+    def estimated(self, estimate: RunEstimate | None, *, stages: int) -> None:
+        """Print what the run will take, and count the time from here."""
+        self._time = TimeLeft(estimate, stages=stages)
+        if estimate is not None:
+            self._print(estimate_line(estimate))
 
     def part_started(self, stage: int, part: str) -> None:
         """Count batches anew in each stage."""
         if part == "transport":
             self._batch = 0
+            if self._time is not None:
+                self._time.stage_started()
+
+    def iteration_finished(self, stage: int, iteration: Iteration) -> None:
+        """Count the gradients."""
+        if self._time is not None:
+            self._time.evaluated(int((~iteration.loss.isnan()).sum()))
+
+    def stage_finished(self, result: StageResult) -> None:
+        """Leave a line that stays."""
+        if self._time is not None:
+            self._time.stage_finished()
+        self._print(_stage_line(result) + self._time_text())
+
+    def stages_revised(self, revision: Revision) -> None:
+        """Leave a line that stays."""
+        self._print(_revision_line(revision) + self._time_text())
+
+    def _time_text(self) -> str:
+        """Time that passed and time that is left, where they are known."""
+        if self._time is None:
+            return ""
+        left = self._time.seconds()
+        return f", {duration(self._time.elapsed)} so far" + ("" if not left else f", about {duration(left)} left")
 
     def optimization_started(self, stage: int, worlds: int, memory_estimate: int) -> None:
         """Count the batch; print the memory estimate, unless it was told for no smaller a batch."""
@@ -65,6 +98,18 @@ class _Count(rich_progress.ProgressColumn):
         return Text("" if task.total is None else f"{task.completed:.0f}/{task.total:.0f}")
 
 
+class _Left(rich_progress.ProgressColumn):
+    """The time left, as told last."""
+
+    def __init__(self, text: Callable[[], str]) -> None:
+        super().__init__()
+        self._text = text
+
+    def render(self, task: rich_progress.Task) -> Text:
+        """See rich."""
+        return Text(self._text(), style="progress.remaining")
+
+
 class ProgressBar(Progress):
     """A bar with stage, iteration, loss, best loss and time left; for terminals. A context manager.
 
@@ -81,8 +126,7 @@ class ProgressBar(Progress):
             rich_progress.BarColumn(),
             _Count(),
             rich_progress.TimeElapsedColumn(),
-            rich_progress.TextColumn("left"),
-            rich_progress.TimeRemainingColumn(),
+            _Left(self._left_text),
             console=Console(stderr=True),
             transient=True,
         )
@@ -94,6 +138,10 @@ class ProgressBar(Progress):
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._progress.stop()
+
+    def _left_text(self) -> str:
+        left = None if self._time is None else self._time.seconds()
+        return "" if left is None else f"about {duration(left)} left"
 
     def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
         """Learn the number of stages."""
@@ -107,6 +155,7 @@ class ProgressBar(Progress):
 
     def iteration_finished(self, stage: int, iteration: Iteration) -> None:
         """Move the bar; a refinement, whose length is its own, only changes the text."""
+        super().iteration_finished(stage, iteration)
         if iteration.phase != SEARCH:
             self._progress.update(self._bar, description=f"stage {stage + 1} {iteration.phase}  {_losses(iteration)}")
             return
@@ -118,14 +167,6 @@ class ProgressBar(Progress):
             completed=(stage - self._first_stage) * iteration.count + iteration.index + 1,
             description=f"stage {stage + 1}/{self._first_stage + (self._stages or 1)}, batch {self._batch}  {_losses(iteration)}",
         )
-
-    def stage_finished(self, result: StageResult) -> None:
-        """Leave a line that stays."""
-        self._print(_stage_line(result))
-
-    def stages_revised(self, revision: Revision) -> None:
-        """Leave a line that stays."""
-        self._print(_revision_line(revision))
 
     def _print(self, line: str) -> None:
         self._progress.console.print(line, highlight=False)
@@ -145,19 +186,20 @@ class ProgressLines(Progress):
 
     def iteration_finished(self, stage: int, iteration: Iteration) -> None:
         """Print a line if the last one is some time ago."""
+        super().iteration_finished(stage, iteration)
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + SECONDS_BETWEEN_LINES
             name = "iteration" if iteration.phase == SEARCH else iteration.phase
             text = f"stage {stage + 1}, batch {self._batch}, {name} {iteration.index + 1}/{iteration.count}, {_losses(iteration)}"
-            self._print(text)
+            self._print(text + self._time_text())
 
-    def stage_finished(self, result: StageResult) -> None:
-        """Print a line."""
-        self._print(_stage_line(result))
 
-    def stages_revised(self, revision: Revision) -> None:
-        """Print a line."""
-        self._print(_revision_line(revision))
+def estimate_line(estimate: RunEstimate) -> str:
+    """What a run will take, in a line."""
+    least, most = estimate.effort.scaled(estimate.stages, estimate.stages).gradients
+    memory = " to ".join(megabytes(count) for count in estimate.memory)
+    work = f"stages {estimate.stages}, {least} to {most} gradient evaluations"
+    return f"estimate: {duration_range(estimate.seconds)}, memory {memory} ({work}; pictures left out)"
 
 
 def megabytes(count: int) -> str:

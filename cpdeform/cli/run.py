@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,8 +16,10 @@ from cpdeform.cli.interruption import exit_code
 from cpdeform.run.flags import FLAGS
 
 if TYPE_CHECKING:
+    from cpdeform.cli.progress import Progress
     from cpdeform.core.plugins import Registry
-    from cpdeform.planning.result import DeformResult, Observer
+    from cpdeform.planning.result import DeformResult
+    from cpdeform.run.estimate import RunEstimate
     from cpdeform.run.record import RunRecorder
     from cpdeform.run.resolve import ResolvedRun
 
@@ -90,6 +92,8 @@ def run(
     resolved = resolve_command(given, settings or [], resume=resume, out=out)
     if dry_run:
         _print_configuration(resolved, as_json=as_json)
+        if not quiet:
+            _print_estimate(resolved)
         return
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         # Libraries print to stdout, too; a reader of the JSON must not see that.
@@ -184,7 +188,7 @@ def _execute(resolved: ResolvedRun, out: Path | None, *, overwrite: bool, silent
     )
     try:
         with recorder, _progress(configuration.stages, resolved.first_stage, silent=silent) as observers:
-            result = resolved.run([recorder, *observers])
+            result = resolved.run([recorder, *observers], on_estimate=_teller(observers, resolved))
     except KeyboardInterrupt as error:
         typer.echo(_interruption(recorder), err=True)
         raise typer.Exit(exit_code(error)) from error
@@ -201,6 +205,28 @@ def _print_configuration(resolved: ResolvedRun, *, as_json: bool) -> None:
         "task": resolved.task.model_dump(mode="json"),
     }
     typer.echo(json.dumps(content) if as_json else yaml.safe_dump(content, sort_keys=False).rstrip())
+
+
+def _print_estimate(resolved: ResolvedRun) -> None:
+    """Print on stderr what a run would take; a rollout is measured for it."""
+    from cpdeform.cli.progress import estimate_line
+
+    try:
+        line = estimate_line(resolved.estimate(resolved.planner()))
+    except Exception as error:
+        line = f"no estimate: {error}"
+    typer.echo(line, err=True)
+
+
+def _teller(observers: list[Progress], resolved: ResolvedRun) -> Callable[[RunEstimate | None], None] | None:
+    """What tells the observers of the estimate; None where there are none, so that nothing is measured."""
+    stages = resolved.configuration.stages or resolved.task.stage_count
+
+    def tell(estimate: RunEstimate | None) -> None:
+        for observer in observers:
+            observer.estimated(estimate, stages=stages)
+
+    return tell if observers else None
 
 
 def _interruption(recorder: RunRecorder) -> str:
@@ -224,7 +250,7 @@ def _default_directory(task: str) -> Path:
 
 
 @contextlib.contextmanager
-def _progress(stages: int | None, first_stage: int, *, silent: bool) -> Iterator[list[Observer]]:
+def _progress(stages: int | None, first_stage: int, *, silent: bool) -> Iterator[list[Progress]]:
     """Observers that show the progress: none, a bar on a terminal, else lines."""
     from cpdeform.cli.progress import ProgressBar, ProgressLines
 

@@ -129,6 +129,14 @@ class Placer(abc.ABC):
         """The transport problem whose solution `Stage.transport` holds; None where the placer needs no priorities."""
         return TransportProblem() if self.capabilities.needs_priorities else None
 
+    def expected_proposals(self, movable: int) -> tuple[int, int]:
+        """Proposals of a round, about, and rounds of a stage, at most, for the estimate before a run.
+
+        Args:
+            movable: Number of movable tools.
+        """
+        return 4, 1
+
     @abc.abstractmethod
     def ask(self, stage: Stage) -> list[Proposal]:
         """Propose candidates; they share the budget of a round.

@@ -10,6 +10,10 @@ class PlacerFixed(Placer):
 
     capabilities = PlacerCapabilities(needs_priorities=False, max_tools=None)
 
+    def expected_proposals(self, movable: int) -> tuple[int, int]:
+        """See `Placer`."""
+        return 1, 1
+
     def ask(self, stage: Stage) -> list[Proposal]:
         """Propose the current poses as the only candidate."""
         return [Proposal(pose=stage.state.tool_pose[0].clone(), score=float("nan"), label="fixed")]

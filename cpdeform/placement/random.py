@@ -70,6 +70,10 @@ class PlacerRandom(Placer):
             grid_size=grid_size, refinements=refinements, clearance=clearance, margin=margin, max_gap=max_gap
         )
 
+    def expected_proposals(self, movable: int) -> tuple[int, int]:
+        """See `Placer`."""
+        return self.candidates, self.rounds
+
     def ask(self, stage: Stage) -> list[Proposal]:
         """Propose `candidates` placements, fewer where no drawn particle can be touched.
 

@@ -17,6 +17,7 @@ from cpdeform.core.options import real_number, whole_number
 from cpdeform.core.simulator import Simulator
 from cpdeform.core.state import State
 from cpdeform.planning.batches import Evaluator
+from cpdeform.planning.effort import Effort
 from cpdeform.planning.executor import Executor, ExecutorSerial
 from cpdeform.planning.pruner import Pruner, PrunerHalving
 from cpdeform.planning.race import Race
@@ -113,6 +114,16 @@ class TrajectoryOptimizer:
     def initial_actions(self, shape: tuple[int, int, int], generator: torch.Generator) -> Tensor:
         """First actions (B, T, A): small Gaussian noise, clipped to [-1, 1]."""
         return (self.initial_noise * torch.randn(shape, generator=generator)).clamp(-1.0, 1.0)
+
+    def effort(self, worlds: int) -> Effort:
+        """Gradients of a descent: at least those before its patience ends, at most all that the pruner leaves."""
+        active, done = torch.arange(worlds), 0
+        counts = []
+        for index in range(self.iterations):
+            done += len(active)
+            counts.append(done)
+            active = self.pruner.survivors(active, torch.zeros(worlds), done=index + 1, iterations=self.iterations)
+        return Effort(gradients=(counts[min(self.patience, self.iterations - 1)], done))
 
     def _rate(self, index: int) -> float:
         """Step size of an iteration, in units of action."""

@@ -11,6 +11,7 @@ from cpdeform.core.objective import Objective
 from cpdeform.core.placer import Placer
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start, contact_points_discovery
+from cpdeform.planning.effort import Effort
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.descent import PhaseDescent, PhaseRefinement
 from cpdeform.planning.phases.phase import Phase
@@ -78,6 +79,14 @@ class Strategy(abc.ABC):
             return search
         objective, optimizer = parts.refinement
         return (*search, PhaseRefinement(objective=objective, optimizer=optimizer))
+
+    def effort(self, stage: Effort) -> Effort:
+        """What a stage costs with all that the loop adds, for the estimate before a run; defaults to what its phases cost.
+
+        Args:
+            stage: What the phases cost.
+        """
+        return stage
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult | Revision]:
         """Lead from stage to stage, and maybe come back to some; defaults to the loop of Algorithm 1."""

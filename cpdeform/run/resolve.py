@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from cpdeform.core.errors import InputError, PluginError
@@ -30,6 +30,7 @@ from cpdeform.planning.result import Observer, StageResult
 from cpdeform.planning.strategy import Parts, Strategy
 from cpdeform.run.checks.check import warn_about_tools
 from cpdeform.run.configuration import RunConfiguration
+from cpdeform.run.estimate import RunEstimate, estimate_run, stage_effort
 from cpdeform.run.hook_observer import HookObserver
 from cpdeform.run.origins import Origin, trace_origins
 from cpdeform.run.parts import (
@@ -176,19 +177,46 @@ class ResolvedRun:
             names=self.names,
         )
 
+    def _estimate_or_none(self, planner: Planner) -> RunEstimate | None:
+        """The estimate; whatever makes it fail, the run itself tells better."""
+        try:
+            return self.estimate(planner)
+        except Exception:
+            return None
+
     def _share(self) -> dict[str, int]:
         """The simulator's threads where several processes share the cores."""
         known = self.registry.option_names("simulator", self.configuration.backend)
         return {"threads": self._threads()} if self.configuration.workers > 1 and known is not None and "threads" in known else {}
 
-    def run(self, observers: Sequence[Observer] = ()) -> RunResult:
+    def estimate(self, planner: Planner) -> RunEstimate:
+        """What the run will take; measures a short rollout and its gradient.
+
+        Args:
+            planner: Its parts.
+
+        Raises:
+            InputError: There is not enough memory.
+        """
+        configuration = self.configuration
+        effort = self.strategy.effort(stage_effort(planner))
+        return estimate_run(planner, stages=configuration.stages, workers=configuration.workers, effort=effort)
+
+    def run(
+        self, observers: Sequence[Observer] = (), *, on_estimate: Callable[[RunEstimate | None], None] | None = None
+    ) -> RunResult:
         """Run it; as `cpdeform.deform`.
 
         Args:
             observers: Told of every iteration and stage, in order; the plugins' observers come after them.
+            on_estimate: Told what the run will take, before it starts: None where that cannot be known. Without it nothing is
+                measured.
         """
         with self.executor() or contextlib.nullcontext() as executor:
-            found = self.planner(observers, executor=executor).run(
+            planner = self.planner(observers, executor=executor)
+            if on_estimate is not None:
+                on_estimate(self._estimate_or_none(planner))
+            found = planner.run(
                 stages=self.configuration.stages, state=self.state, first_stage=self.first_stage, previous=self.previous
             )
         fields = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}

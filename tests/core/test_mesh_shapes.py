@@ -128,13 +128,16 @@ def test_gradients_equal_finite_differences() -> None:
 
 
 def test_shape_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    write_shape(tmp_path / "good.npz", make_grid(mesh_of(ball(0.05)), resolution=12))
+    write_shape(tmp_path / "good.npz", make_grid(mesh_of(trimesh.creation.box((0.1, 0.1, 0.1))), resolution=12))
     with np.load(tmp_path / "good.npz") as file:
         arrays = dict(file)
     for name, value in {
         "distance": np.abs(arrays["distance"]),
         "spacing": np.float64(-1.0),
         "faces": arrays["faces"] + 10000,
+        "sharp_cell": arrays["sharp_cell"] + arrays["distance"].size,
+        "sharp_triangle": arrays["sharp_triangle"] - len(arrays["faces"]),
+        "sharp_start": arrays["sharp_start"][::-1],
     }.items():
         np.savez(tmp_path / "bad.npz", **{**arrays, name: value})
         with pytest.raises(InputError, match=r"bad\.npz"):

@@ -5,11 +5,15 @@ import zlib
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from cpdeform.core.scene import ToolChopsticks
+from cpdeform.core.meshes.grid import make_grid, write_shape
+from cpdeform.core.meshes.mesh import Mesh
+from cpdeform.core.scene import ToolChopsticks, ToolMesh
 from cpdeform.core.shapes.tool import shape_of
 from cpdeform.report.page.encoding import QUANTA, decode_frames, encode_frames, encode_levels, spatial_order
 from cpdeform.report.page.shapes import describe_tools, goal_distance
+from cpdeform.report.shapes import tool_surface
 from cpdeform.report.surface import clay_surface, particle_spacing
 
 
@@ -110,3 +114,38 @@ def test_points_of_a_tool_move_evenly_with_its_gap():
     closed, wide = np.frombuffer(zlib.decompress(arrays[described["array"]]()), dtype="<f4").reshape(2, -1, 3)
     wanted = shape_of(tool, gap=0.3).surface(rows=16, columns=36).reshape(-1, 3)
     np.testing.assert_allclose(closed + 0.3 * (wide - closed), wanted, atol=1e-6)
+
+
+def mesh_tool(directory, *, subdivisions):
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("igl")
+    made = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.05)
+    mesh = Mesh(np.array(made.vertices), np.array(made.faces, dtype=np.int64))
+    write_shape(directory / "ball.npz", make_grid(mesh, resolution=16))
+    return ToolMesh(position=(0, 0, 0), file=directory / "ball.npz", scale=2.0)
+
+
+@pytest.mark.parametrize("most", [30_000, 100])
+def test_a_mesh_tool_has_its_own_triangles_or_fewer(tmp_path, monkeypatch, most):
+    """The page's mesh is closed, its sides turned outwards: it encloses the tool's volume."""
+    monkeypatch.setattr("cpdeform.report.page.shapes.MOST_TRIANGLES", most)
+    tool, arrays = mesh_tool(tmp_path, subdivisions=3), {}
+    (described,) = describe_tools([tool], arrays)
+    json.dumps(described)
+    vertices = np.frombuffer(zlib.decompress(arrays[described["array"]]()), dtype="<f4").reshape(-1, 3)
+    triangles = np.frombuffer(zlib.decompress(arrays[described["triangles"]]()), dtype="<u4").reshape(-1, 3)
+    assert described["points"] == len(vertices)
+    assert (len(triangles) == 1280) == (most == 30_000)
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.1, rtol=0.02)
+    a, b, c = (vertices[triangles[:, corner]].astype(float) for corner in range(3))
+    assert np.einsum("fi,fi->", a, np.cross(b, c)) / 6.0 == pytest.approx(4.0 / 3.0 * np.pi * 0.1**3, rel=0.05)
+
+
+def test_points_on_a_mesh_tool_leave_no_gaps(tmp_path):
+    tool = mesh_tool(tmp_path, subdivisions=1)
+    points = tool_surface(tool, np.array([0.5, 0.5, 0.5, 1.0, 0.0, 0.0, 0.0, 0.0]), rows=40, columns=60).reshape(-1, 3)
+    assert 2400 < len(points) < 6000
+    made = np.random.default_rng(0).normal(size=(2000, 3))
+    places = 0.5 + 0.1 * made / np.linalg.norm(made, axis=1, keepdims=True)
+    # The ball of 80 triangles is up to 0.008 flatter than a sphere.
+    assert cKDTree(points).query(places)[0].max() < 0.013

@@ -84,8 +84,64 @@ def build_distance(real: Any) -> SimpleNamespace:
         return inside - ti.cast(base, real), base, u - inside
 
     @ti.func
-    def mesh_surface(values: ti.template(), first, size, p, g):
-        """As `surface`, of a mesh: the quadratic B-spline of its distance; beyond the grid the way there is added."""
+    def numbers_at(values: ti.template(), first):
+        return vec3(values[first], values[first + 1], values[first + 2])
+
+    @ti.func
+    def triangles_surface(values: ti.template(), lists, found, p, g):
+        """As `surface`, of the nearest of the triangles in the list at `found`; see `SharpCells.kernel_numbers`."""
+        least = real(1e30)
+        way = vec3(zero, zero, zero)  # from the nearest place
+        mean = vec3(zero, one, zero)  # the mean normal there
+        edge = vec3(zero, zero, zero)  # along its edge; zero on a face or at a corner
+        face = False
+        for n in range(ti.cast(values[found], ti.i32)):
+            t = lists + ti.cast(values[found + 1 + n], ti.i32)
+            normal = numbers_at(values, t + 9)
+            inside = True
+            for i in ti.static(range(3)):
+                corner = numbers_at(values, t + 3 * i)
+                along = numbers_at(values, t + 3 * ((i + 1) % 3)) - corner
+                if normal.cross(along).dot(p - corner) < zero:
+                    inside = False
+            if inside:
+                height = (p - numbers_at(values, t)).dot(normal)
+                if height * height < least:
+                    least = height * height
+                    way = height * normal
+                    mean = normal
+                    face = True
+            else:
+                for i in ti.static(range(3)):
+                    corner = numbers_at(values, t + 3 * i)
+                    along = numbers_at(values, t + 3 * ((i + 1) % 3)) - corner
+                    share = ti.min(ti.max((p - corner).dot(along) / along.dot(along), real(zero)), real(one))
+                    aside = p - corner - share * along
+                    if aside.dot(aside) < least:
+                        least = aside.dot(aside)
+                        way = aside
+                        face = False
+                        edge = vec3(zero, zero, zero)
+                        if share <= zero:
+                            mean = numbers_at(values, t + 21 + 3 * i)
+                        elif share >= one:
+                            mean = numbers_at(values, t + 21 + 3 * ((i + 1) % 3))
+                        else:
+                            mean = numbers_at(values, t + 12 + 3 * i)
+                            edge = along / ti.sqrt(along.dot(along))
+        distance = way.dot(mean)
+        result = mean
+        bend = vec3(zero, zero, zero)
+        if not face:
+            distance = ti.sqrt(least) * sign(distance)
+            if ti.abs(distance) >= real(1e-7):
+                result = way / distance
+                bend = project(g - g.dot(edge) * edge, result) / distance
+        return result, distance, bend, real(one)
+
+    @ti.func
+    def spline_surface(values: ti.template(), first, size, p, g):
+        """As `surface`: the quadratic B-spline of a mesh's distance; beyond the grid the way there is added."""
         fx, bx, ox = mesh_place(p[0], size[0], size[1])
         fy, by, oy = mesh_place(p[1], size[0], size[2])
         fz, bz, oz = mesh_place(p[2], size[0], size[3])
@@ -116,6 +172,26 @@ def build_distance(real: Any) -> SimpleNamespace:
             mixed[1] * a[0] + mixed[2] * a[1] + straight[2] * a[2],
         )
         return normal, distance, bend / (steep * size[0] * size[0]), steep
+
+    @ti.func
+    def mesh_surface(values: ti.template(), first, size, p, g):
+        """As `surface`, of a mesh: that of triangles at sharp edges, else that of `spline_surface`."""
+        _, bx, _ = mesh_place(p[0], size[0], size[1])
+        _, by, _ = mesh_place(p[1], size[0], size[2])
+        _, bz, _ = mesh_place(p[2], size[0], size[3])
+        rows, columns = ti.cast(size[2], ti.i32), ti.cast(size[3], ti.i32)
+        nodes = ti.cast(size[1], ti.i32) * rows * columns
+        found = ti.cast(values[first + nodes + (bx * rows + by) * columns + bz], ti.i32)
+        distance = real(zero)
+        normal = vec3(zero, one, zero)
+        bend = vec3(zero, zero, zero)
+        steepness = real(one)
+        if found > 0:
+            lists = first + 2 * nodes
+            normal, distance, bend, steepness = triangles_surface(values, lists, lists + found, p, g)
+        else:
+            normal, distance, bend, steepness = spline_surface(values, first, size, p, g)
+        return normal, distance, bend, steepness
 
     @ti.func
     def surface(values: ti.template(), first, kind, size, p, g):

@@ -86,8 +86,64 @@ def build_distance(real: Any) -> SimpleNamespace:
         return inside - real(base), base, u - inside
 
     @wp.func
-    def mesh_surface(grids: wp.array(dtype=real), first: int, size: vec4, p: vec3, g: vec3):
-        """As `surface`, of a mesh: the quadratic B-spline of its distance; beyond the grid the way there is added."""
+    def grid_vector(grids: wp.array(dtype=real), first: int):
+        return vec3(grids[first], grids[first + 1], grids[first + 2])
+
+    @wp.func
+    def triangles_surface(grids: wp.array(dtype=real), lists: int, found: int, p: vec3, g: vec3):
+        """As `surface`, of the nearest of the triangles in the list at `found`; see `SharpCells.kernel_numbers`."""
+        least = real(1e30)
+        way = vec3(zero, zero, zero)  # from the nearest place
+        mean = vec3(zero, one, zero)  # the mean normal there
+        edge = vec3(zero, zero, zero)  # along its edge; zero on a face or at a corner
+        face = int(0)
+        for n in range(int(grids[found])):
+            t = lists + int(grids[found + 1 + n])
+            normal = grid_vector(grids, t + 9)
+            inside = int(1)
+            for i in range(3):
+                corner = grid_vector(grids, t + 3 * i)
+                along = grid_vector(grids, t + 3 * ((i + 1) % 3)) - corner
+                if wp.dot(wp.cross(normal, along), p - corner) < zero:
+                    inside = int(0)
+            if inside == 1:
+                height = wp.dot(p - grid_vector(grids, t), normal)
+                if height * height < least:
+                    least = height * height
+                    way = height * normal
+                    mean = normal
+                    face = int(1)
+            else:
+                for i in range(3):
+                    corner = grid_vector(grids, t + 3 * i)
+                    along = grid_vector(grids, t + 3 * ((i + 1) % 3)) - corner
+                    share = wp.min(wp.max(wp.dot(p - corner, along) / wp.dot(along, along), zero), one)
+                    aside = p - corner - share * along
+                    if wp.dot(aside, aside) < least:
+                        least = wp.dot(aside, aside)
+                        way = aside
+                        face = int(0)
+                        edge = vec3(zero, zero, zero)
+                        if share <= zero:
+                            mean = grid_vector(grids, t + 21 + 3 * i)
+                        elif share >= one:
+                            mean = grid_vector(grids, t + 21 + 3 * ((i + 1) % 3))
+                        else:
+                            mean = grid_vector(grids, t + 12 + 3 * i)
+                            edge = along / wp.sqrt(wp.dot(along, along))
+        distance = wp.dot(way, mean)
+        result = mean
+        bend = vec3(zero, zero, zero)
+        if face == 0:
+            distance = wp.sqrt(least) * sign(distance)
+            if wp.abs(distance) >= real(1e-7):
+                result = way / distance
+                bend = project(g - wp.dot(g, edge) * edge, result) / distance
+        return result, distance, bend, one
+
+    @wp.func
+    def spline_surface(grids: wp.array(dtype=real), first: int, size: vec4, p: vec3, g: vec3):
+        """As `surface`: the quadratic B-spline of a mesh's distance; beyond the grid the way there is added."""
         fx, bx, ox = mesh_place(p[0], size[0], size[1])
         fy, by, oy = mesh_place(p[1], size[0], size[2])
         fz, bz, oz = mesh_place(p[2], size[0], size[3])
@@ -121,6 +177,25 @@ def build_distance(real: Any) -> SimpleNamespace:
             mixed[1] * a[0] + mixed[2] * a[1] + straight[2] * a[2],
         )
         return normal, distance, bend / (steep * size[0] * size[0]), steep
+
+    @wp.func
+    def mesh_surface(grids: wp.array(dtype=real), first: int, size: vec4, p: vec3, g: vec3):
+        """As `surface`, of a mesh: that of triangles at sharp edges, else that of `spline_surface`."""
+        fx, bx, ox = mesh_place(p[0], size[0], size[1])
+        fy, by, oy = mesh_place(p[1], size[0], size[2])
+        fz, bz, oz = mesh_place(p[2], size[0], size[3])
+        nodes = int(size[1]) * int(size[2]) * int(size[3])
+        found = int(grids[first + nodes + (bx * int(size[2]) + by) * int(size[3]) + bz])
+        distance = zero
+        normal = vec3(zero, one, zero)
+        bend = vec3(zero, zero, zero)
+        steepness = one
+        if found > 0:
+            lists = first + 2 * nodes
+            normal, distance, bend, steepness = triangles_surface(grids, lists, lists + found, p, g)
+        else:
+            normal, distance, bend, steepness = spline_surface(grids, first, size, p, g)
+        return normal, distance, bend, steepness
 
     @wp.func
     def surface(grids: wp.array(dtype=real), first: int, kind: int, size: vec4, p: vec3, g: vec3):

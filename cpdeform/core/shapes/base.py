@@ -53,6 +53,10 @@ class Shape(abc.ABC):
             columns: Points around, about.
         """
 
+    def triangles(self) -> tuple[Array, NDArray[np.int64]] | None:
+        """Corners (V, 3), length units, and triangles (F, 3) of a surface that is no grid; None where `surface` is all of it."""
+        return None
+
     @property
     @abc.abstractmethod
     def volume(self) -> float:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cpdeform.core.meshes.grid import DistanceGrid, read_shape
 from cpdeform.core.model import PositiveFloat, Vector3
@@ -70,7 +71,7 @@ class ShapeMesh(Shape):
         return axes @ axes.new_tensor(0.5 * self.grid.mesh.extents)
 
     def surface(self, *, rows: int, columns: int) -> Array:
-        """Points (R, C, 3) spread over the surface, in no order; see `mesh` for its triangles."""
+        """Points (R, C, 3) spread over the surface, in no order; see `triangles`."""
         mesh = self.grid.mesh
         corners = mesh.vertices[mesh.faces]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -81,6 +82,10 @@ class ShapeMesh(Shape):
         base = corners[chosen]
         points = base[:, 0] + first * (base[:, 1] - base[:, 0]) + second * (base[:, 2] - base[:, 0])
         return np.asarray(points.reshape(rows, columns, 3))
+
+    def triangles(self) -> tuple[Array, NDArray[np.int64]]:
+        """See `Shape`: the mesh's own."""
+        return self.grid.mesh.vertices, self.grid.mesh.faces
 
     @property
     def volume(self) -> float:
@@ -123,7 +128,7 @@ class ToolMesh(ToolBase):
     @property
     def kernel_grid(self) -> Array:
         """See `ToolBase`."""
-        return self.grid.coefficients
+        return self.grid.kernel_numbers
 
 
 class BodyMesh(BodyBase):

@@ -68,7 +68,7 @@ class ToolBase(FrozenModel, abc.ABC):
 
     @property
     def kernel_grid(self) -> Array | None:
-        """Numbers (X, Y, Z) on a grid that simulators' kernels compute the shape from, too; None for shapes of few lengths."""
+        """Numbers (K,) that simulators' kernels compute the shape from, too; None for shapes of few lengths."""
         return None
 
     @property

@@ -83,6 +83,11 @@ class PlacerTouch(Placer):
         """Displacements are where the contacts are drawn by; drawing needs no three digits of them."""
         return TransportProblem(exponent=DISPLACEMENT_EXPONENT, tolerance=TOLERANCE)
 
+    def expected_proposals(self, movable: int) -> tuple[int, int]:
+        """See `Placer`; the rounds of variations are smaller."""
+        rounds = 1 + len(self.widths)
+        return (self.count + self.variations * len(self.widths)) // rounds, rounds
+
     def ask(self, stage: Stage) -> list[Proposal]:
         """Random touches in the first round of a stage, variations of the best in the others.
 

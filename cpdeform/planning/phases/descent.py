@@ -9,6 +9,7 @@ import torch
 
 from cpdeform.core.objective import Objective
 from cpdeform.core.placer import Candidate
+from cpdeform.planning.effort import Effort
 from cpdeform.planning.optimizer import SEARCH, TrajectoryOptimizer
 from cpdeform.planning.phases.phase import Phase, Scope
 from cpdeform.planning.workbench import Workbench
@@ -31,6 +32,10 @@ class PhaseDescent(Phase):
     optimizer: TrajectoryOptimizer
     objective: Objective | None = None
     name: str = SEARCH
+
+    def effort(self, candidates: int) -> Effort:
+        """See `Phase`."""
+        return self.optimizer.effort(candidates)
 
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
         """Candidates with the best plan of each; those with an infinite loss are left as they are."""
@@ -59,6 +64,10 @@ class PhaseRefinement(Phase):
     objective: Objective
     optimizer: TrajectoryOptimizer
     name: str = REFINEMENT
+
+    def effort(self, candidates: int) -> Effort:
+        """See `Phase`; the plan that it finds is executed."""
+        return self.optimizer.effort(1) + Effort(rollouts=(0, 1))
 
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
         """The candidates whose loss fell; the plan itself is the first one tried, so that nothing is lost."""

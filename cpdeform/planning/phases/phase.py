@@ -6,6 +6,7 @@ import abc
 from typing import ClassVar, Literal
 
 from cpdeform.core.placer import Candidate
+from cpdeform.planning.effort import Effort
 from cpdeform.planning.workbench import Workbench
 
 Scope = Literal["round", "search", "plan"]
@@ -40,6 +41,14 @@ class Phase(abc.ABC):
             Of a round or a search, the same candidates in the same order, with plans and losses; infinite losses mark those that
             the next phases leave out. Of a plan, the changed candidate, or nothing where nothing was gained.
         """
+
+    def effort(self, candidates: int) -> Effort:
+        """What `run` costs, for the estimate before a run; nothing unless overridden.
+
+        Args:
+            candidates: Number of candidates that it is given.
+        """
+        return Effort()
 
     def accepts(self, loss: float, *, loss_before: float, loss_now: float) -> bool:
         """Whether a plan that was executed counts.

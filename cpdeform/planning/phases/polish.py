@@ -10,6 +10,7 @@ import torch
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate
 from cpdeform.planning.coarse import CoarseModel
+from cpdeform.planning.effort import Effort
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.choice import best_unlike
 from cpdeform.planning.phases.phase import Phase, Scope
@@ -40,6 +41,11 @@ class PhasePolish(Phase):
     def __post_init__(self) -> None:
         if self.keep < 1:
             raise InputError("keep", came=str(self.keep), expected="at least 1")
+
+    def effort(self, candidates: int) -> Effort:
+        """See `Phase`."""
+        descent = self.optimizer.effort(min(self.keep, candidates))
+        return descent if self.coarse is None else Effort(rollouts=descent.gradients)
 
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
         """All candidates, the best of them with better plans; unless `exclusive`, a plan is never worse than before."""

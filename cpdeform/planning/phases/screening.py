@@ -11,6 +11,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.objective import Objective
 from cpdeform.core.placer import Candidate
 from cpdeform.planning.coarse import CoarseModel
+from cpdeform.planning.effort import Effort
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.phase import Phase, Scope
 from cpdeform.planning.workbench import Workbench
@@ -44,6 +45,10 @@ class PhaseScreening(Phase):
     def __post_init__(self) -> None:
         if self.keep < 1:
             raise InputError("keep", came=str(self.keep), expected="at least 1")
+
+    def effort(self, candidates: int) -> Effort:
+        """See `Phase`."""
+        return Effort(rollouts=(candidates, candidates))
 
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
         """All candidates, the losses of those that are left out infinite."""

@@ -9,6 +9,7 @@ import torch
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate
+from cpdeform.planning.effort import Effort
 from cpdeform.planning.phases.choice import best_unlike
 from cpdeform.planning.phases.phase import Phase, Scope
 from cpdeform.planning.workbench import Workbench
@@ -33,6 +34,10 @@ class PhaseTrial(Phase):
     def __post_init__(self) -> None:
         if self.keep < 1:
             raise InputError("keep", came=str(self.keep), expected="at least 1")
+
+    def effort(self, candidates: int) -> Effort:
+        """See `Phase`."""
+        return Effort(rollouts=(0, min(self.keep, candidates)))
 
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
         """All candidates with their plans; finite losses only where a rollout told them."""

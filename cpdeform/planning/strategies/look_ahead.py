@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from cpdeform.core.errors import InputError
 from cpdeform.core.state import State
 from cpdeform.planning.algorithm import Planner, Start
+from cpdeform.planning.effort import Effort
 from cpdeform.planning.interrupted import StageInterrupted
 from cpdeform.planning.result import StageResult, Status
 from cpdeform.planning.strategies.cpdeform import StrategyCpdeform
@@ -56,6 +57,10 @@ class StrategyLookAhead(StrategyCpdeform):
         if width < 1:
             raise InputError("width", came=str(width), expected="at least 1")
         self.width = width
+
+    def effort(self, stage: Effort) -> Effort:
+        """See `Strategy`; there are several paths from the second stage on."""
+        return stage.scaled(1, self.width) + Effort(rollouts=(0, self.width))
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult]:
         """Stages of the best path, known only when all paths have come to their end, or the run is interrupted."""

@@ -14,6 +14,7 @@ from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
 from cpdeform.planning.coarse import CoarseModel
+from cpdeform.planning.effort import Effort
 from cpdeform.planning.interrupted import StageInterrupted, StagesInterrupted
 from cpdeform.planning.joint import PHASE as JOINT_POLISH
 from cpdeform.planning.joint import polish_jointly
@@ -116,6 +117,11 @@ class StrategySculpt(Strategy):
                 for number, (keep, optimizer) in enumerate(optimizers)
             ),
         )
+
+    def effort(self, stage: Effort) -> Effort:
+        """See `Strategy`; a stage has a part in the joint descents, too: on the way in those after it, half of all on average."""
+        on_the_way = (self.together - 1) // self.joint_every * self._interim.iterations // 2
+        return stage + Effort(gradients=(0, on_the_way + self._joint.iterations))
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult | Revision]:
         """One touch a stage, from rest to rest, some polished together; a few stages without a gain do not end the run."""

@@ -65,6 +65,23 @@ def test_a_tool_that_kernels_cannot_take_is_refused(name: str, value: Any, named
         scene.add_tool(**cases.tool_arguments(**{name: value}))
 
 
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [(27, 0.5), (30, 1e9), (53, -3.0), (54, float("nan")), (55, 0.0), (55, 40.0), (56, 7.0), (56, -1.0), (56, 1e300)],
+)
+def test_a_mesh_whose_lists_lead_elsewhere_is_refused(place: int, value: float) -> None:
+    # 27 coefficients, 27 places of lists, a 0, a list of one triangle, the triangle
+    numbers = np.zeros(27 + 27 + 3 + 30)
+    numbers[[27 + 13, 55, 56]] = 1.0, 1.0, 3.0
+    mesh = {"kind": 7, "size": (0.01, 3.0, 3.0, 3.0)}
+    _simulator.Scene(**cases.scene_arguments()).add_tool(**cases.tool_arguments(**mesh, grid=numbers))
+    numbers[place] = value
+    with pytest.raises(ValueError, match="grid"):
+        _simulator.Scene(**cases.scene_arguments()).add_tool(**cases.tool_arguments(**mesh, grid=numbers))
+    with pytest.raises(ValueError, match="grid"):
+        _simulator.Scene(**cases.scene_arguments()).add_tool(**cases.tool_arguments(**mesh, grid=numbers[:54]))
+
+
 @pytest.mark.parametrize("threads", [0, -5, 1 << 30])
 def test_threads_are_counted(threads: int) -> None:
     with pytest.raises(ValueError, match="threads"):

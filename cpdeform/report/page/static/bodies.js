@@ -83,19 +83,19 @@ function setIndices(geometry, triangles) {
   geometry.setDrawRange(0, triangles.length);
 }
 
-/** A tool: a grid of points, turned and moved by its pose; one with a gap is a mixture of two grids. */
+/** A tool: a grid of points or a mesh, turned and moved by its pose; one with a gap is a mixture of two grids. */
 class Tool {
-  constructor(description, surfaces, material) {
+  constructor(description, surfaces, triangles, material) {
     const { BufferAttribute, BufferGeometry, Mesh, toCreasedNormals } = libraries;
     const { rows, columns } = description;
-    this.points = 3 * rows * columns;
+    this.points = 3 * description.points;
     this.surfaces = surfaces;
     this.count = description.surfaces;
     this.gap = NaN;
     this.makeGeometry = () => {
       const geometry = new BufferGeometry();
       geometry.setAttribute("position", new BufferAttribute(this.mixed(), 3));
-      geometry.setIndex(gridTriangles(rows, columns));
+      geometry.setIndex(triangles ? new BufferAttribute(triangles, 1) : gridTriangles(rows, columns));
       return toCreasedNormals(geometry, CREASE);
     };
     this.mesh = new Mesh(new BufferGeometry(), material);

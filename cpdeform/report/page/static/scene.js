@@ -89,7 +89,9 @@ class View {
   async loadTools() {
     const { tools } = this.content;
     const surfaces = await Promise.all(tools.map((tool) => loadFloats(tool.array)));
-    const make = (...look) => tools.map((tool, number) => new Tool(tool, surfaces[number], solidMaterial(...look, this.clay.uniforms)));
+    const triangles = await Promise.all(tools.map((tool) => (tool.triangles ? loadIndices(tool.triangles) : null)));
+    const solid = (look) => solidMaterial(...look, this.clay.uniforms);
+    const make = (...look) => tools.map((tool, number) => new Tool(tool, surfaces[number], triangles[number], solid(look)));
     this.tools = make(TOOL_COLOUR, TOOL_OPACITY);
     this.otherTools = make(OTHER_COLOUR, OTHER_OPACITY);
     for (const tool of [...this.tools, ...this.otherTools]) this.scene.add(tool.mesh);

@@ -49,8 +49,6 @@ Engine<Real>* make_engine(InstructionSet set, const Scene& scene, const double* 
   return choose(engines_baseline::make_engine_float, engines_baseline::make_engine_double);
 }
 
-int64_t grid_size_of(const Tool& tool) { return int64_t(tool.size[1]) * int64_t(tool.size[2]) * int64_t(tool.size[3]); }
-
 // Everything that a history needs to stay alive.
 template <class Real>
 struct Shared {
@@ -61,7 +59,7 @@ struct Shared {
     for (int m = 0; m < s.tool_count; ++m) {
       Tool& tool = s.tools[m];
       if (!tool.grid) continue;
-      grids[m].assign(tool.grid, tool.grid + grid_size_of(tool));
+      grids[m].assign(tool.grid, tool.grid + tool.grid_count);
       tool.grid = grids[m].data();
     }
     return s;
@@ -228,10 +226,13 @@ void add_tool(Scene& scene, int kind, const std::vector<double>& size, double fr
   if (kind == mesh) {
     for (int a = 1; a < 4; ++a) expect_between("size", int64_t(std::min(size[a], 1e6)), 3, most_grid_nodes);
     if (!grid) throw std::invalid_argument("grid: got nothing, expected the distances of a mesh");
-    expect_shape("grid", *grid, {int64_t(size[1]), int64_t(size[2]), int64_t(size[3])});
+    const int64_t count = grid->ndim() ? int64_t(grid->shape(0)) : 0;
+    expect_shape("grid", *grid, {count});
+    check_mesh(grid->data(), count, int64_t(size[1]) * int64_t(size[2]) * int64_t(size[3]));
   }
   Tool& tool = scene.tools[scene.tool_count++];
   tool.grid = kind == mesh ? grid->data() : nullptr;
+  tool.grid_count = kind == mesh ? int64_t(grid->shape(0)) : 0;
   tool.kind = kind;
   tool.friction = friction;
   tool.action_offset = scene.action_size;

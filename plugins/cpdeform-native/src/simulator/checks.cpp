@@ -27,6 +27,14 @@ void expect_not_negative(const std::string& name, double value) {
   if (!(std::isfinite(value) && value >= 0)) refuse(name, value, "zero or a positive number");
 }
 
+constexpr int64_t triangle_size = 30;
+
+// A place of `size` numbers among `count`, which is a whole number.
+int64_t expect_place(double came, int64_t size, int64_t count) {
+  if (!(came >= 0 && came <= double(count - size) && came == std::floor(came))) refuse("grid", came, "a place within the numbers");
+  return int64_t(came);
+}
+
 // How many of a tool's lengths must be positive.
 size_t lengths_of(int kind) {
   switch (kind) {
@@ -66,6 +74,22 @@ void check_numbers(const char* name, const std::vector<double>& numbers, size_t 
                                 std::to_string(least) + (most > least ? " to " + std::to_string(most) : std::string()));
   for (const double number : numbers)
     if (!std::isfinite(number)) refuse(name, number, "finite numbers");
+}
+
+void check_mesh(const double* numbers, int64_t count, int64_t nodes) {
+  if (count <= 2 * nodes) refuse("grid", double(count), "more than two numbers a node");
+  for (int64_t i = 0; i < count; ++i)
+    if (!std::isfinite(numbers[i])) refuse("grid", numbers[i], "finite numbers");
+  const double* lists = numbers + 2 * nodes;
+  count -= 2 * nodes;
+  for (int64_t node = 0; node < nodes; ++node) {
+    const double place = numbers[nodes + node];
+    if (place == 0) continue;
+    const double* list = lists + expect_place(place, 2, count);
+    const int64_t triangles = expect_place(list[0], 1, count - (list - lists));
+    if (triangles < 1) refuse("grid", list[0], "at least one triangle in a list");
+    for (int64_t i = 1; i <= triangles; ++i) expect_place(list[i], triangle_size, count);
+  }
 }
 
 void check_scene(const Scene& scene) {

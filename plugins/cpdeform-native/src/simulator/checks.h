@@ -16,6 +16,10 @@ void check_scene(const Scene& scene);
 void check_tool(int kind, const std::vector<double>& size, double friction, int action_size, const std::vector<double>& scale,
                 const std::vector<double>& lower, const std::vector<double>& upper);
 
+// The numbers of a mesh's distances on so many nodes: a coefficient of each; a number for each, 0 or where its list is; the lists, each
+// the number of its triangles and where the numbers of each are; the triangles. Places are counted from behind the nodes' numbers.
+void check_mesh(const double* numbers, int64_t count, int64_t nodes);
+
 // That there are between `least` and `most` numbers, all finite.
 void check_numbers(const char* name, const std::vector<double>& numbers, std::size_t least, std::size_t most);
 

@@ -130,8 +130,59 @@ struct Geometry {
     cpdeform::throw_unknown_tool(kind);
   }
 
+  // The signed distance to the nearest of some triangles, the normal there, and how it changes along g. `list` is the number of
+  // triangles and where the numbers of each are (see triangles.py), counted from `numbers`.
+  static Surface triangles_surface(const double* numbers, const double* list, const P& p, const P& g) {
+    Real least = Real(1e30);
+    P way, mean, edge;  // from the nearest place, the mean normal there, and along its edge; no edge on a face or at a corner
+    bool face = false;
+    for (int n = 1; n <= int(list[0]); ++n) {
+      const double* t = numbers + int64_t(list[n]);
+      const P normal = vector(t + 9);
+      P offset[3], along[3];
+      bool inside = true;
+      for (int i = 0; i < 3; ++i) {
+        const P corner = vector(t + 3 * i);
+        offset[i] = p - corner;
+        along[i] = vector(t + 3 * ((i + 1) % 3)) - corner;
+        inside = inside && dot(cross(normal, along[i]), offset[i]) >= 0;
+      }
+      if (inside) {
+        const Real height = dot(offset[0], normal);
+        if (height * height < least) {
+          least = height * height;
+          way = normal * height;
+          mean = normal;
+          face = true;
+        }
+        continue;
+      }
+      for (int i = 0; i < 3; ++i) {
+        const Real share = clamp(dot(offset[i], along[i]) / dot(along[i], along[i]), 0, 1);
+        const P from = offset[i] - along[i] * share;
+        if (dot(from, from) < least) {
+          least = dot(from, from);
+          way = from;
+          mean = vector(t + (share <= 0 ? 21 + 3 * i : share >= 1 ? 21 + 3 * ((i + 1) % 3) : 12 + 3 * i));
+          edge = share > 0 && share < 1 ? along[i] * (1 / std::sqrt(dot(along[i], along[i]))) : P{};
+          face = false;
+        }
+      }
+    }
+    if (face) return {mean, dot(way, mean), {}};
+    const Real length = std::sqrt(least), distance = dot(way, mean) < 0 ? -length : length;
+    if (length < Real(1e-7)) return {mean, distance, {}};
+    const P normal = way * (1 / distance);
+    return {normal, distance, across(g - edge * dot(g, edge), normal) * (1 / distance)};
+  }
+
+  CPDEFORM_INLINE static P vector(const double* from) { return {Real(from[0]), Real(from[1]), Real(from[2])}; }
+  CPDEFORM_INLINE static P cross(const P& a, const P& b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+  }
+
   // The quadratic B-spline of a mesh's signed distance, its normalised gradient, and the change of that along g. Beyond the grid, the
-  // distance at its nearest point and the way there.
+  // distance at its nearest point and the way there. At sharp edges, the distance to triangles.
   static Surface mesh_surface(const Real* size, const double* grid, const P& p, const P& g) {
     const Real at[3] = {p.x, p.y, p.z};
     Real weight[3][3], slope[3][3], beyond = 0;
@@ -152,6 +203,10 @@ struct Geometry {
       slope[a][1] = -2 * f;
       slope[a][2] = high;
     }
+    const int64_t nodes = int64_t(count[0]) * count[1] * count[2];
+    const double* lists = grid + 2 * nodes;
+    const double list = grid[nodes + (int64_t(base[0]) * count[1] + base[1]) * count[2] + base[2]];
+    if (list > 0) return triangles_surface(lists, lists + int64_t(list), p, g);
     const Real curve[3] = {1, -2, 1};
     Real distance = 0;
     P gradient, straight, mixed;

@@ -11,7 +11,9 @@ struct Tool {
   int kind;
   double size[4];  // Sphere: radius. Capsule, RollingPin, Chopsticks: radius, height. Box: half extents, rounding. Cylinder: radius,
                    // half height. Torus: major radius, tube radius. Mesh: distance between nodes, numbers of nodes.
-  const double* grid;  // Mesh: coefficients of the quadratic B-spline of the distances, C order; not owned
+  const double* grid;  // Mesh: coefficients of the quadratic B-spline of the distances, C order; a number for each node, 0 or where
+                       // the list of the triangles nearest to it is; the lists and triangles (see checks.h); not owned
+  int64_t grid_count;
   double friction;
   int action_offset;
   int action_size;

@@ -1,0 +1,32 @@
+"""How much a stage may cost, counted before it starts."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Effort:
+    """Work between two bounds, each of one world.
+
+    Attributes:
+        gradients: Fewest and most evaluations of a loss and its gradient.
+        rollouts: Fewest and most rollouts without a gradient.
+    """
+
+    gradients: tuple[int, int] = (0, 0)
+    rollouts: tuple[int, int] = (0, 0)
+
+    def __add__(self, other: Effort) -> Effort:
+        return Effort(_sum(self.gradients, other.gradients), _sum(self.rollouts, other.rollouts))
+
+    def scaled(self, least: int, most: int) -> Effort:
+        """The work done at least and at most so many times."""
+        return Effort(
+            (least * self.gradients[0], most * self.gradients[1]),
+            (least * self.rollouts[0], most * self.rollouts[1]),
+        )
+
+
+def _sum(first: tuple[int, int], second: tuple[int, int]) -> tuple[int, int]:
+    return first[0] + second[0], first[1] + second[1]
