@@ -17,7 +17,7 @@ from cpdeform.core.ray_session import connected
 from cpdeform.sweep.claim import silent, take
 from cpdeform.sweep.engine import Engine
 from cpdeform.sweep.queue import DONE, FAILED, Queue, write_whole
-from cpdeform.sweep.worker import Outcome, Worker, WorkSettings, return_lost
+from cpdeform.sweep.worker import Outcome, Worker, WorkSettings, is_ready, return_lost
 
 GIGABYTE = 1e9
 LOOK_EVERY = 0.5
@@ -108,8 +108,7 @@ class _Driver:
         for name in left:
             if len(self._tasks) >= self._most:
                 break
-            first = self._queue.job(name).after
-            if name not in handed and name not in taken and (first is None or first in over):
+            if name not in handed and name not in taken and is_ready(self._queue, name):
                 self._tasks[self._task.remote(self._request, name)] = name
         return bool(left)
 
