@@ -26,8 +26,8 @@ def connect(address: str | None) -> bool:
         return False
     try:
         with contextlib.redirect_stdout(None):
-            own = {"include_dashboard": False} if address is None else {}
-            ray.init(address=address, log_to_driver=False, logging_level="warning", **own)
+            dashboard = False if address is None else None
+            ray.init(address=address, log_to_driver=False, logging_level="warning", include_dashboard=dashboard)
     except (ConnectionError, ValueError, RuntimeError) as error:
         came = "none that answers" if address is None else f"{address}, which does not answer"
         raise InputError("--address", came=came, expected=f"the address of a Ray cluster ({str(error).splitlines()[0]})") from error
