@@ -68,6 +68,14 @@ def cpdeform_engines() -> list[PluginSpec]:  # type: ignore[empty-body]
 
 
 @hookspec
+def cpdeform_executors() -> list[PluginSpec]:  # type: ignore[empty-body]
+    """Register executors (`cpdeform.planning.executor.Executor`), which compute the candidates of a run.
+
+    They are context managers, made with the keywords `workers` and `threads` (of each worker).
+    """
+
+
+@hookspec
 def cpdeform_commands() -> list[PluginSpec]:  # type: ignore[empty-body]
     """Register commands of the command line: functions whose annotated parameters Typer reads, such as `cpdeform.cli.run.run`.
 

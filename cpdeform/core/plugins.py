@@ -27,6 +27,7 @@ KINDS: Mapping[str, str] = {
     "task": "cpdeform_tasks",
     "job": "cpdeform_jobs",
     "engine": "cpdeform_engines",
+    "executor": "cpdeform_executors",
     "command": "cpdeform_commands",
 }
 """What can be registered, and the hook that registers it."""

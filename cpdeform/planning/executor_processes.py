@@ -57,7 +57,7 @@ class ExecutorProcesses:
         """
         if len(items) < 2:
             return [function(item) for item in items]
-        path, contents = self._send(function), [_pack(item) for item in items]
+        path, contents = self._send(function), [pack(item) for item in items]
         for _ in range(TRIES):
             # What a broken pool was at is lost, but no answer depends on what came before.
             with contextlib.suppress(BrokenProcessPool), self._environment():
@@ -81,7 +81,7 @@ class ExecutorProcesses:
         """File with the function, for processes that do not have it yet."""
         if self._sent is None or self._sent[0] != function:
             path = Path(self._folder.name) / uuid.uuid4().hex
-            path.write_bytes(_pack(function))
+            path.write_bytes(pack(function))
             if self._sent is not None:
                 self._sent[1].unlink(missing_ok=True)
             self._sent = (function, path)
@@ -113,7 +113,7 @@ class ExecutorProcesses:
                     os.environ[name] = value
 
 
-def _pack(content: object) -> bytes:
+def pack(content: object) -> bytes:
     """Pickle it here: torch's own way to other processes shares memory through files, of which there are few."""
     try:
         return pickle.dumps(content, protocol=pickle.HIGHEST_PROTOCOL)

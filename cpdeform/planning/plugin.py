@@ -1,4 +1,4 @@
-"""Registers the built-in strategies."""
+"""Registers the built-in strategies and executors."""
 
 from __future__ import annotations
 
@@ -28,5 +28,23 @@ def cpdeform_strategies() -> list[PluginSpec]:
             name="look-ahead",
             target="cpdeform.planning.strategies.look_ahead:StrategyLookAhead",
             summary="a beam over stages: several states go on, the best path is kept",
+        ),
+    ]
+
+
+@hookimpl
+def cpdeform_executors() -> list[PluginSpec]:
+    """Where the candidates of a run are computed."""
+    return [
+        PluginSpec(
+            name="processes",
+            target="cpdeform.planning.executor_processes:ExecutorProcesses",
+            summary="processes on this machine (the default)",
+        ),
+        PluginSpec(
+            name="ray",
+            target="cpdeform.planning.executor_ray:ExecutorRay",
+            summary="tasks of a Ray cluster",
+            extra="cpdeform[ray]",
         ),
     ]

@@ -27,6 +27,7 @@ from cpdeform.core.scene import FrozenModel
 from cpdeform.planning.objectives.contact import ContactKind
 
 DEFAULT_STRATEGY = "cpdeform"
+DEFAULT_EXECUTOR = "processes"
 
 
 class OptimizerConfiguration(FrozenModel):
@@ -125,6 +126,8 @@ class RunConfiguration(FrozenModel):
             user overrides.
         workers: Processes that batches of candidates are spread over; the threads of each are its share of the cores, unless
             ``simulator_options.threads`` says otherwise.
+        executor: Registered name of what computes the batches where there are several workers: ``"processes"`` of this machine, or
+            ``"ray"``.
         optimizer: Options of the optimiser.
         objective: Options of the loss.
         priorities: Options of the transport priorities.
@@ -134,6 +137,7 @@ class RunConfiguration(FrozenModel):
         ot_options: Further keyword options of the transport solver that gives the priorities.
         placer_options: Keyword options of the placer.
         strategy_options: Keyword options of the strategy.
+        executor_options: Keyword options of the executor, such as ``{"address": "10.0.0.1:6379"}``.
     """
 
     task: str = "writer"
@@ -148,6 +152,7 @@ class RunConfiguration(FrozenModel):
     goal: Path | None = None
     strategy: str = DEFAULT_STRATEGY
     workers: Workers = 1
+    executor: str = DEFAULT_EXECUTOR
     optimizer: OptimizerConfiguration = OptimizerConfiguration()
     objective: ObjectiveConfiguration = ObjectiveConfiguration()
     priorities: PrioritiesConfiguration = PrioritiesConfiguration()
@@ -157,6 +162,7 @@ class RunConfiguration(FrozenModel):
     ot_options: dict[str, Any] = Field(default_factory=dict)
     placer_options: dict[str, Any] = Field(default_factory=dict)
     strategy_options: dict[str, Any] = Field(default_factory=dict)
+    executor_options: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="before")
     @classmethod

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 from cpdeform.core.errors import InputError, PluginError
@@ -24,12 +25,11 @@ from cpdeform.core.state import State
 from cpdeform.core.task import Task, changed_task, limited_task, load_task, merge, validate
 from cpdeform.planning.algorithm import Planner
 from cpdeform.planning.executor import Executor, ExecutorSerial
-from cpdeform.planning.executor_processes import ExecutorProcesses
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.result import Observer, StageResult
 from cpdeform.planning.strategy import Parts, Strategy
 from cpdeform.run.checks.check import warn_about_tools
-from cpdeform.run.configuration import RunConfiguration
+from cpdeform.run.configuration import DEFAULT_EXECUTOR, RunConfiguration
 from cpdeform.run.estimate import RunEstimate, estimate_run, stage_effort
 from cpdeform.run.hook_observer import HookObserver
 from cpdeform.run.origins import Origin, trace_origins
@@ -111,10 +111,15 @@ class ResolvedRun:
         }
         return {kind: getattr(self.configuration, kind) if part is None else type(part).__name__ for kind, part in given.items()}
 
-    def executor(self) -> ExecutorProcesses | None:
-        """Processes for the configuration's workers, to be closed after use; None for one worker, which is this process."""
-        workers = self.configuration.workers
-        return None if workers == 1 else ExecutorProcesses(workers, threads=self._threads())
+    def executor(self) -> AbstractContextManager[Executor]:
+        """What computes batches of worlds; with one worker it is this process."""
+        name, workers = self.configuration.executor, self.configuration.workers
+        if workers == 1:
+            return contextlib.nullcontext(ExecutorSerial())
+        made: AbstractContextManager[Executor] = self.registry.create(
+            "executor", name, workers=workers, threads=self._threads(), **self.configuration.executor_options
+        )
+        return made
 
     def _threads(self) -> int:
         """Threads of each worker, those of this process included: what comes of a run does not depend on who computes it."""
@@ -212,7 +217,7 @@ class ResolvedRun:
             on_estimate: Told what the run will take, before it starts: None where that cannot be known. Without it nothing is
                 measured.
         """
-        with self.executor() or contextlib.nullcontext() as executor:
+        with self.executor() as executor:
             planner = self.planner(observers, executor=executor)
             if on_estimate is not None:
                 on_estimate(self._estimate_or_none(planner))
@@ -330,10 +335,14 @@ def _check_names(configuration: RunConfiguration, objects: PartObjects, *, regis
         ("ot_solver", configuration.ot, objects.ot_solver),
         ("placer", configuration.placer, objects.placer),
         ("strategy", configuration.strategy, objects.strategy),
+        ("executor", configuration.executor, None),
     )
     for kind, name, part in named:
         if part is None and name != AUTO:
             registry.find(kind, name)
+    if configuration.executor != DEFAULT_EXECUTOR and configuration.workers == 1:
+        expected = f"at least 2 for the executor {configuration.executor}: one worker is this process"
+        raise InputError("workers", came="1", expected=expected)
     for option, place in OWN_FIELDS.items():
         if option in configuration.simulator_options:
             remedy = f"Set {place} instead."

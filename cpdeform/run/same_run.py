@@ -31,7 +31,7 @@ def same_run(record: RunRecord, configuration: RunConfiguration, task: Task) -> 
 
 
 def _same_configuration(record: RunRecord, configuration: RunConfiguration) -> bool:
-    apart = {"task", "goal", "stages", "workers"}
+    apart = {"task", "goal", "stages", "workers", "executor", "executor_options"}
     recorded = recorded_configuration(record).model_dump(mode="json", exclude=apart)
     return recorded == configuration.model_dump(mode="json", exclude=apart)
 

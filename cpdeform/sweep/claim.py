@@ -149,9 +149,15 @@ def silent(queue: Queue, *, after: float) -> list[tuple[str, str | None]]:
     for name in sorted(queue.listed(CLAIMS)):
         path = queue.file(CLAIMS, name)
         with contextlib.suppress(FileNotFoundError):
-            if now - path.stat().st_mtime > after:
+            if now - path.stat().st_mtime > after and now - _changed(path) > after:
                 found.append((name, claimant(path)))
     return found
+
+
+def _changed(path: Path) -> float:
+    """When a file was changed, as the machine that keeps it has it: NFS clients remember what they saw until a file is opened."""
+    with path.open("rb") as file:
+        return os.fstat(file.fileno()).st_mtime
 
 
 def file_system_time(queue: Queue) -> float:

@@ -181,12 +181,23 @@ class Queue:
 
 def write_whole(path: Path, content: Mapping[str, Any]) -> None:
     """Write a JSON file so that others see all of it or none; whoever writes the same file does not get in the way."""
+    with writing_whole(path, content):
+        pass
+
+
+@contextlib.contextmanager
+def writing_whole(path: Path, content: Mapping[str, Any]) -> Iterator[None]:
+    """Write a JSON file, which appears as a whole at the end of the block, unless that raises.
+
+    It is on the disk before the block begins: where the disk is full, nothing of the block is done.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{os.urandom(4).hex()}")
     try:
         with temporary.open("w", encoding="utf-8") as file:
             json.dump(content, file)
             file.flush()
             os.fsync(file.fileno())
+        yield
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)

@@ -17,12 +17,12 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cpdeform.core.errors import CpdeformError, InputError, brief
+from cpdeform.core.errors import CpdeformError, EngineError, InputError, brief
 from cpdeform.core.machine import available_cores, thread_environment
 from cpdeform.core.plugins import load_registry
 from cpdeform.sweep.claim import STALE_AFTER, Claim, deaths, heartbeat, lose, silent, take
 from cpdeform.sweep.job import Job, JobContext, JobFunction
-from cpdeform.sweep.queue import ATTEMPTS, CLAIMS, DONE, FAILED, Queue, write_whole
+from cpdeform.sweep.queue import ATTEMPTS, CLAIMS, DONE, FAILED, Queue, write_whole, writing_whole
 from cpdeform.sweep.settle import settle
 
 if TYPE_CHECKING:
@@ -95,6 +95,10 @@ class Outcome:
     figures: dict[str, Any]
 
 
+class _TakenError(Exception):
+    """Another worker has the directory of an attempt."""
+
+
 class Worker:
     """Does the jobs of a sweep, one after the other, in this process.
 
@@ -165,14 +169,15 @@ class Worker:
     def _do(self, claim: Claim) -> Outcome | None:
         begin, used = time.perf_counter(), time.process_time()
         outcome, figures = DONE, {}
-        job: Job | None = None
+        place: Path | None = None
         try:
             job = self.queue.job(claim.name)
             _adopt(claim)
+            place = self.queue.directory / job.record
             with self._observe(job) as observers:
                 context = JobContext(job=job, sweep=self.queue.directory, directory=claim.attempt, observers=observers)
                 figures = self._function(context)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             outcome, figures = FAILED, {"reason": reason_of(error)}
         if not claim.held:
             shutil.rmtree(claim.attempt, ignore_errors=True)
@@ -184,12 +189,31 @@ class Worker:
             "worker": self.identity,
             "finished_at": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         }
-        if job is not None:
-            settle(claim.attempt, self.queue.directory / job.record)
-        write_whole(self.queue.file(outcome, claim.name), figures)
+        if not self._finish(claim, place, outcome, figures):
+            return None
         if self._own_process:
             keep_what_is_loaded()
         return Outcome(name=claim.name, outcome=outcome, figures=figures)
+
+    def _finish(self, claim: Claim, place: Path | None, outcome: str, figures: Mapping[str, Any]) -> bool:
+        """Put the record in its place, then say that the job is over.
+
+        Returns:
+            False where another worker has taken the record: it believes this one dead, and the job is its own.
+
+        Raises:
+            EngineError: The disk is full, or the like. The record stays where it is, for whoever does the job next.
+        """
+        try:
+            with writing_whole(self.queue.file(outcome, claim.name), figures):
+                if place is not None and not settle(claim.attempt, place) and not claim.held:
+                    raise _TakenError
+        except _TakenError:
+            return False
+        except OSError as error:
+            reason = f"{error.strerror or error}; it is in the queue again"
+            raise EngineError(f"job {claim.name} is over, but this cannot be written: {reason}.") from error
+        return True
 
     def _next(self) -> Claim | None:
         """Claim a job; None where none is to be had now."""
@@ -197,7 +221,7 @@ class Worker:
             if scan:
                 self._left = iter(self._scan())
             for name in self._left:
-                if _is_ready(self.queue, name) and (claim := take(self.queue, name, worker=self.identity)) is not None:
+                if is_ready(self.queue, name) and (claim := take(self.queue, name, worker=self.identity)) is not None:
                     return claim
         return None
 
@@ -254,7 +278,7 @@ def keep_what_is_loaded() -> None:
         gc.freeze()
 
 
-def reason_of(error: Exception) -> str:
+def reason_of(error: BaseException) -> str:
     """Why a job failed, in a line."""
     return brief(str(error) if isinstance(error, CpdeformError) else f"{type(error).__name__}: {error}", REASON_LENGTH)
 
@@ -264,7 +288,7 @@ def _unobserved(job: Job) -> Iterator[Sequence[Observer]]:
     yield ()
 
 
-def _is_ready(queue: Queue, name: str) -> bool:
+def is_ready(queue: Queue, name: str) -> bool:
     """Whether the job that has to come first, if there is one, is over."""
     try:
         first = queue.job(name).after

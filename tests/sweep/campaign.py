@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import multiprocessing
 import random
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +19,20 @@ from toy_fixtures import write_toy_distribution, write_toy_task
 from typer.testing import CliRunner
 
 from cpdeform.cli.main import app
+from cpdeform.run.record_files import RUN_FILE
 from cpdeform.sweep.claim import claimant
-from cpdeform.sweep.queue import CLAIMS, Queue
+from cpdeform.sweep.queue import ATTEMPTS, CLAIMS, DONE, Queue
 from cpdeform.sweep.status import sweep_status
-from cpdeform.sweep.worker import Worker
+from cpdeform.sweep.worker import Worker, WorkSettings
 
 STAGES = 3
 TIMES = frozenset({"seconds", "time", "recorded_at", "memory", "rollout", "objective", "vjp", "optimizer"})
 """Fields of a record that no two runs have in common."""
 
-SECONDS_TO_WAIT = 600.0
+PRELOADED = ["torch", "torch._dynamo", "h5py", "cpdeform.run.resolve", "cpdeform.run.record_continued", "cpdeform.ot.divergence"]
+"""What workers find loaded: to load it anew after each kill would take most of the time."""
+
+SECONDS_TO_WAIT = 1800.0
 
 
 class Campaign:
@@ -70,50 +73,56 @@ class Campaign:
         Args:
             name: Name of the sweep.
             workers: Workers at the same time, each a command of its own.
-            every: Seconds between kills.
+            every: Seconds between kills; more where no job was done in that time, as on a machine with much else to do.
             most: Kills at most.
             seed: Which of them is killed.
 
         Returns:
             The sweep, over, and how many workers were killed.
         """
-        queue, chance, killed = self.new(name), random.Random(seed), 0
+        queue, chance, killed, done_before = self.new(name), random.Random(seed), 0, -1
         running = {f"w{number}": self.worker(queue, f"w{number}") for number in range(workers)}
         limit = time.monotonic() + SECONDS_TO_WAIT
         try:
             while not sweep_status(queue).over:
                 assert time.monotonic() < limit, sweep_status(queue)
                 time.sleep(every)
-                at_work = self.at_work(queue, list(running))
-                if not at_work or killed == most:
+                at_work, done = self.at_work(queue, list(running)), len(queue.listed(DONE))
+                if not at_work or killed == most or done == done_before:
                     continue
+                done_before = done
                 victim = chance.choice(at_work)
-                running[victim].send_signal(signal.SIGKILL)
-                running.pop(victim).wait()
+                running[victim].kill()
+                running.pop(victim).join()
                 killed += 1
                 running[f"w{workers + killed}"] = self.worker(queue, f"w{workers + killed}")
         finally:
             for process in running.values():
-                process.terminate()
-                process.wait()
+                process.kill()
+                process.join()
         return queue, killed
 
     @staticmethod
     def at_work(queue: Queue, workers: Sequence[str]) -> list[str]:
-        """Those of the workers that have a job: one that only starts could be killed for ever."""
-        busy = {claimant(queue.file(CLAIMS, name)) for name in queue.listed(CLAIMS)}
-        return [worker for worker in workers if worker in busy]
+        """Those of the workers in the midst of a job: one that only loads its libraries could be killed for ever."""
+        owners = {name: claimant(queue.file(CLAIMS, name)) for name in queue.listed(CLAIMS)}
+        begun = {owner for name, owner in owners.items() if (queue.place(ATTEMPTS) / f"{name}@{owner}" / RUN_FILE).exists()}
+        return [worker for worker in workers if worker in begun]
 
-    def worker(self, queue: Queue, identity: str) -> subprocess.Popen[str]:
-        """A worker in a process of its own that nobody watches."""
-        settings = {"stale_after": 3.0, "attempts": 50}
-        quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "text": True}
-        command = [sys.executable, "-P", "-m", "cpdeform.sweep.engines.local"]
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, cwd=self.directory, env=self.environment, **quiet)
-        assert process.stdin is not None
-        with process.stdin:
-            json.dump({"directory": str(queue.directory), "identity": identity, "settings": settings}, process.stdin)
+    def worker(self, queue: Queue, identity: str) -> BaseProcess:
+        """A worker in a process of its own that nobody watches, forked from one that has loaded the libraries."""
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(PRELOADED)
+        process = context.Process(target=work_unwatched, args=(str(queue.directory), identity))
+        process.start()
         return process
+
+
+def work_unwatched(directory: str, identity: str) -> None:
+    """Do what there is to do, as a worker's process does."""
+    settings = WorkSettings(stale_after=3.0, attempts=50)
+    for _ in Worker(Queue(directory), settings, identity=identity, own_process=True).work():
+        pass
 
 
 def digests(queue: Queue) -> dict[str, str]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
-from collections.abc import Iterator
 from typing import Any
 
 import psutil
 import pytest
 from campaign import Campaign, digests
+from clusters import ray_cluster
 
 from cpdeform.core.errors import EngineError
 from cpdeform.sweep.engines.local import EngineLocal
@@ -46,21 +45,6 @@ def test_workers_that_die_in_vain_are_an_error(tmp_path, monkeypatch):
     with pytest.raises(EngineError, match="workers die with nothing done"):
         list(EngineLocal(workers=1).work(queue, WorkSettings()))
     assert sweep_status(queue).waiting == 1
-
-
-@contextlib.contextmanager
-def ray_cluster() -> Iterator[Any]:
-    """A Ray cluster on loopback: a head and two more nodes with a core each, every one of several processes."""
-    import ray
-    from ray.cluster_utils import Cluster
-
-    small: dict[str, Any] = {"object_store_memory": 80_000_000, "num_cpus": 1}
-    cluster = Cluster(initialize_head=True, head_node_args={**small, "include_dashboard": False})
-    try:
-        yield cluster, [cluster.add_node(**small) for _ in range(2)]
-    finally:
-        ray.shutdown()
-        cluster.shutdown()
 
 
 def ray_with_a_killed_node(campaign: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:

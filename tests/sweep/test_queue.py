@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -17,12 +18,13 @@ from typer.testing import CliRunner
 from cpdeform.cli.main import app
 from cpdeform.cli.sweep import read_shard
 from cpdeform.cli.sweep_new import read_numbers
-from cpdeform.core.errors import InputError
+from cpdeform.core.errors import EngineError, InputError
 from cpdeform.core.machine import available_cores, machine_cores
 from cpdeform.sweep.claim import heartbeat, lose, silent, take
 from cpdeform.sweep.job import Job, JobContext
 from cpdeform.sweep.plan import combinations
 from cpdeform.sweep.queue import ATTEMPTS, CLAIMS, DONE, FAILED, LOST, Queue, SweepHead
+from cpdeform.sweep.settle import settle
 from cpdeform.sweep.status import sweep_status, throughput, write_sweep_table
 from cpdeform.sweep.worker import Worker, WorkSettings, return_lost
 
@@ -122,6 +124,99 @@ def test_a_worker_that_was_silent_for_too_long_leaves_the_job(tmp_path):
     assert list(slow.work()) == []
     assert [content["square"] for _, content in queue.outcomes()] == [0]
     assert (tmp_path / "records" / "job-000" / "square.txt").read_text() == "0"
+
+
+def test_a_worker_that_wakes_up_at_the_very_end_leaves_the_job(tmp_path, monkeypatch):
+    """It was asleep after it saw that the job was its own; the other, who is not done yet, has its directory."""
+    queue, other = make(tmp_path, 1), []
+
+    def sleep(*arguments: Any) -> Any:
+        monkeypatch.undo()
+        lose(queue, "job-000", worker="slow")
+        other.append(take(queue, "job-000", worker="other"))
+        other[0].attempt.parent.joinpath("job-000@slow").rename(other[0].attempt)
+        return settle(*arguments)
+
+    monkeypatch.setattr("cpdeform.sweep.worker.settle", sleep)
+    slow = Worker(queue, function=square, identity="slow")
+    claim = take(queue, "job-000", worker="slow")
+    assert slow.do(claim) is None
+    # Were the job over now, it would have no record if the other died.
+    assert not queue.is_over("job-000")
+    assert other[0].held
+    assert Worker(queue, function=square, identity="other").do(other[0]) is not None
+    assert (tmp_path / "records" / "job-000" / "square.txt").read_text() == "0"
+    assert [path.name for path in queue.place(DONE).iterdir()] == ["job-000.json"]
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_at_the_end_of_a_job(tmp_path, monkeypatch, number):
+    """What came of the job stays, and whoever does it next finds it; nothing says that it is over."""
+    queue, seen = make(tmp_path, 1), []
+
+    def remember(context: JobContext) -> dict[str, Any]:
+        seen.append(sorted(path.name for path in context.directory.iterdir()))
+        return square(context)
+
+    def full(file: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("cpdeform.sweep.queue.os.fsync", full)
+        with pytest.raises(EngineError, match=f"job-000 is over, but this cannot be written: {os.strerror(number)}"):
+            work(queue, remember)
+    assert not queue.is_over("job-000")
+    assert not any(path for place in (CLAIMS, DONE, FAILED) for path in queue.place(place).iterdir())
+    assert work(queue, remember) == ["job-000"]
+    assert seen == [[], ["square.txt"]]
+
+
+def test_a_job_that_ends_its_process_fails(tmp_path):
+    """Where it ended the worker with exit code 0, that would pass for one with nothing left to do."""
+    queue = make(tmp_path, 2)
+
+    def leave(context: JobContext) -> dict[str, Any]:
+        if context.job.name == "job-000":
+            sys.exit(0)
+        return square(context)
+
+    assert work(queue, leave) == ["job-000", "job-001"]
+    assert {name: content.get("reason") for name, content in queue.outcomes()} == {"job-000": "SystemExit: 0", "job-001": None}
+
+
+def test_a_job_that_takes_its_directory_away_is_done(tmp_path):
+    queue = make(tmp_path, 1)
+    assert work(queue, lambda context: context.directory.rmdir() or {}) == ["job-000"]
+    assert sweep_status(queue).done == 1
+
+
+def test_a_heartbeat_that_is_only_seen_when_the_file_is_opened(tmp_path, monkeypatch):
+    """As with NFS, whose clients may answer from memory until then."""
+    queue, stat = make(tmp_path, 1), Path.stat
+    assert take(queue, "job-000", worker="far") is not None
+
+    def remembered(path: Path, **options: Any) -> os.stat_result:
+        found = stat(path, **options)
+        return os.stat_result([*found[:8], found.st_mtime - 100.0, found.st_ctime]) if path.name == "job-000.json" else found
+
+    monkeypatch.setattr(Path, "stat", remembered)
+    assert silent(queue, after=60.0) == []
+
+
+def test_only_the_first_signal_interrupts():
+    """Control-C reaches a worker twice: from the terminal, and from the command that watches it."""
+    script = (
+        "import os, signal\n"
+        "from cpdeform.sweep.engines.local import interrupt_once\n"
+        "interrupt_once()\n"
+        "try:\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "except KeyboardInterrupt:\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    print('given back')\n"
+    )
+    finished = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert finished.stdout == "given back\n"
 
 
 def test_heartbeats(tmp_path):

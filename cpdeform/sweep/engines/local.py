@@ -16,7 +16,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from types import FrameType
 
-from cpdeform.core.errors import EngineError
+from cpdeform.core.errors import CpdeformError, EngineError
 from cpdeform.core.machine import machine_cores, thread_environment
 from cpdeform.sweep.engine import Engine
 from cpdeform.sweep.queue import Queue
@@ -136,7 +136,18 @@ def _end(queue: Queue, settings: WorkSettings, children: set[_Child]) -> None:
             return_lost(queue, settings, worker=child.identity)
 
 
+def interrupt_once() -> None:
+    """Let the first SIGINT or SIGTERM interrupt this process, and no other: they would break off the giving back of a job.
+
+    Control-C reaches all processes of a terminal, and the one that watches tells its workers to end, too.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
+
+
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    for other in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(other, signal.SIG_IGN)
     raise KeyboardInterrupt
 
 
@@ -144,13 +155,18 @@ def main() -> None:
     """Work as the request on stdin says; each job that is over is a line of JSON on stdout."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
-    signal.signal(signal.SIGTERM, _interrupt)
+    interrupt_once()
     request = json.load(sys.stdin)
     settings = WorkSettings.from_json(request["settings"])
-    with answers, contextlib.suppress(KeyboardInterrupt):
-        for outcome in Worker(Queue(Path(request["directory"])), settings, identity=request["identity"], own_process=True).work():
-            answers.write(json.dumps(dataclasses.asdict(outcome)) + "\n")
-            answers.flush()
+    try:
+        with answers, contextlib.suppress(KeyboardInterrupt):
+            worker = Worker(Queue(Path(request["directory"])), settings, identity=request["identity"], own_process=True)
+            for outcome in worker.work():
+                answers.write(json.dumps(dataclasses.asdict(outcome)) + "\n")
+                answers.flush()
+    except CpdeformError as error:
+        sys.stderr.write(f"cpdeform: a worker ends: {error}\n")
+        sys.exit(1)
 
 
 if __name__ == "__main__":

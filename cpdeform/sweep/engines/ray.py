@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 import time
@@ -14,10 +13,11 @@ import ray
 
 from cpdeform.core.errors import EngineError, InputError
 from cpdeform.core.machine import thread_environment
+from cpdeform.core.ray_session import connected
 from cpdeform.sweep.claim import silent, take
 from cpdeform.sweep.engine import Engine
 from cpdeform.sweep.queue import DONE, FAILED, Queue, write_whole
-from cpdeform.sweep.worker import Outcome, Worker, WorkSettings, return_lost
+from cpdeform.sweep.worker import Outcome, Worker, WorkSettings, is_ready, return_lost
 
 GIGABYTE = 1e9
 LOOK_EVERY = 0.5
@@ -34,7 +34,8 @@ class EngineRay(Engine):
 
     Args:
         workers: Tasks at the same time; defaults to as many as the cluster has room for.
-        address: Of the cluster, e.g. ``"auto"`` or ``"10.0.0.1:6379"``; defaults to a new one on this machine.
+        address: Of the cluster, e.g. ``"auto"`` or ``"10.0.0.1:6379"``; defaults to that of ``RAY_ADDRESS``, else to a new one on
+            this machine.
         gpus: GPUs of each job; parts of one are possible.
         memory_gb: Memory of each job, 1e9 bytes; None to declare none.
 
@@ -53,14 +54,8 @@ class EngineRay(Engine):
 
     def work(self, queue: Queue, settings: WorkSettings) -> Iterator[Outcome]:
         """Do all jobs; see `Engine.work`."""
-        own = not ray.is_initialized()
-        if own:
-            _connect(self.address)
-        try:
+        with connected(self.address):
             yield from _Driver(queue, settings, self).work()
-        finally:
-            if own:
-                ray.shutdown()
 
     def resources(self, queue: Queue, settings: WorkSettings) -> dict[str, Any]:
         """What a task declares."""
@@ -113,8 +108,7 @@ class _Driver:
         for name in left:
             if len(self._tasks) >= self._most:
                 break
-            first = self._queue.job(name).after
-            if name not in handed and name not in taken and (first is None or first in over):
+            if name not in handed and name not in taken and is_ready(self._queue, name):
                 self._tasks[self._task.remote(self._request, name)] = name
         return bool(left)
 
@@ -143,13 +137,3 @@ def _do(request: dict[str, Any], name: str) -> dict[str, Any] | None:
         return None
     outcome = Worker(queue, settings, identity=identity, own_process=True).do(claim)
     return None if outcome is None else dataclasses.asdict(outcome)
-
-
-def _connect(address: str | None) -> None:
-    try:
-        with contextlib.redirect_stdout(None):
-            own = {"include_dashboard": False} if address is None else {}
-            ray.init(address=address, log_to_driver=False, logging_level="warning", **own)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        came = "none that answers" if address is None else f"{address}, which does not answer"
-        raise InputError("--address", came=came, expected=f"the address of a Ray cluster ({str(error).splitlines()[0]})") from error
