@@ -69,7 +69,7 @@ def registry(site: Path) -> Registry:
 
 def test_every_hook_has_a_section() -> None:
     text = PAGE.read_text()
-    hooks = [*KINDS.values(), "cpdeform_stage_finished", "cpdeform_run_finished"]
+    hooks = [*KINDS.values(), "cpdeform_stage_finished", "cpdeform_stages_revised", "cpdeform_run_finished"]
     headings = " ".join(line for line in text.splitlines() if line.startswith("## "))
     assert [hook for hook in hooks if hook not in headings] == []
     assert hookimpl.project_name == "cpdeform"
@@ -110,7 +110,13 @@ def test_the_solver_and_the_placer_pass_their_checks(registry: Registry) -> None
 def test_a_run_with_these_parts_lowers_the_loss_and_tells_the_observers(
     registry: Registry, site: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    small = {"strategy_options": {"iterations": 5}, "priorities": {"blur": 0.02}, "objective": {"points": 40, "blur": 0.02}}
+    small = {
+        "workers": 2,
+        "executor": "threads",
+        "strategy_options": {"iterations": 5},
+        "priorities": {"blur": 0.02},
+        "objective": {"points": 40, "blur": 0.02},
+    }
     with caplog.at_level(logging.INFO, logger="my_package"):
         result = deform(
             "nudge",
