@@ -24,3 +24,20 @@ class AlwaysDie:
     def __call__(self, number: int) -> int:
         os.kill(os.getpid(), signal.SIGKILL)
         return number
+
+
+class Refuse:
+    """Raises what a part of a plugin may raise."""
+
+    def __call__(self, number: int) -> int:
+        # Imported here: the others need nothing slow.
+        from cpdeform.core.errors import InputError
+
+        raise InputError("number", came=str(number), expected="none")
+
+
+class Square:
+    """Lives."""
+
+    def __call__(self, number: int) -> int:
+        return number**2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 MESSAGE_LENGTH = 300
 """The most characters of an `InputError`'s text: what came may be of any length, and a user reads the first lines."""
@@ -33,6 +34,18 @@ def brief(text: str, limit: int) -> str:
 
 class CpdeformError(Exception):
     """Base class of every error this package raises on purpose; its text is meant for the user."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled as it is: an error comes back from another process as it was raised there, whatever its constructor takes."""
+        return _restored, (type(self), self.args, dict(self.__dict__))
+
+
+def _restored(kind: type[CpdeformError], arguments: tuple[Any, ...], attributes: dict[str, Any]) -> CpdeformError:
+    """An error that was pickled."""
+    error = kind.__new__(kind)
+    error.args = arguments
+    error.__dict__.update(attributes)
+    return error
 
 
 class InputError(CpdeformError, ValueError):

@@ -2,9 +2,39 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import pytest
 
-from cpdeform.core.errors import MESSAGE_LENGTH, InputError, UnknownNameError, brief, nearest_name
+from cpdeform.core.errors import (
+    MESSAGE_LENGTH,
+    CapabilityError,
+    EngineError,
+    InputError,
+    MissingExtraError,
+    UnknownNameError,
+    brief,
+    nearest_name,
+)
+
+
+def raised(kind):
+    if kind is InputError:
+        return InputError("field", came="5", expected="a number", remedy="Give one.")
+    if kind is UnknownNameError:
+        return UnknownNameError("task", "stra", ["star"])
+    if kind is MissingExtraError:
+        return MissingExtraError("executor", "ray", module="ray", install='pip install "cpdeform[ray]"')
+    return kind("no room")
+
+
+@pytest.mark.parametrize("kind", [InputError, UnknownNameError, MissingExtraError, CapabilityError, EngineError])
+def test_an_error_comes_back_from_another_process_as_it_was_raised(kind):
+    error = raised(kind)
+    for twin in (pickle.loads(pickle.dumps(error)), copy.copy(error)):
+        assert type(twin) is kind
+        assert (str(twin), twin.args, vars(twin)) == (str(error), error.args, vars(error))
 
 
 @pytest.mark.parametrize("part", ["argument", "came", "expected", "remedy"])

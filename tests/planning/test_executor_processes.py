@@ -5,7 +5,7 @@ from __future__ import annotations
 import psutil
 import pytest
 import torch
-from dying import AlwaysDie, Die
+from dying import AlwaysDie, Die, Refuse, Square
 
 from cpdeform.core.errors import EngineError, InputError
 from cpdeform.core.plugins import load_registry
@@ -59,6 +59,10 @@ def test_what_cannot_be_sent_is_refused():
         with pytest.raises(InputError, match="workers: got a part that cannot be sent"):
             executor.map(lambda number: number, range(2))
         assert executor.map(lambda number: number, [7]) == [7]
+        # An error comes back as it was raised, and the processes go on.
+        with pytest.raises(InputError, match="number: got 0, expected none"):
+            executor.map(Refuse(), range(2))
+        assert executor.map(Square(), range(3)) == [0, 1, 4]
     for arguments in ({"workers": 0}, {"workers": 1, "threads": 0}):
         with pytest.raises(InputError, match=r"(workers|threads): got 0"):
             ExecutorProcesses(**arguments)

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Any
 
+import dying
 import pytest
 import torch
 from clusters import ray_cluster
-from dying import AlwaysDie, Die
+from dying import AlwaysDie, Die, Refuse
 from test_executor_processes import STAR
 
 from cpdeform.core.errors import EngineError, InputError
 from cpdeform.core.plugins import load_registry
 from cpdeform.run.resolve import resolve
-
-
-class Refuse:
-    """Raises what a part of a plugin may raise."""
-
-    def __call__(self, number: int) -> int:
-        raise InputError("number", came=str(number), expected="none")
 
 
 @pytest.mark.slow
@@ -32,6 +28,9 @@ def test_a_run_over_a_cluster_is_the_same_run(tmp_path, monkeypatch):
     if "native" not in registry.installed("simulator"):
         pytest.skip("NOT TESTED: the native simulator is not built; others take long to start in each process")
     monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    # The nodes' processes import the module that the dying functions are in.
+    folders = [str(Path(dying.__file__).parent), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, folders)))
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
