@@ -18,7 +18,7 @@ from cpdeform.core.shapes.kinds import TOOLS
 from cpdeform.core.simulator import RolloutGradient, Simulator, SimulatorCapabilities, Trajectory
 from cpdeform.core.state import State
 
-FARTHEST = 0.1
+FARTHEST = 0.3
 """How far a tool is moved out of the clay at most, length units."""
 
 ROUNDING = 1e-6
@@ -29,7 +29,7 @@ class SimulatorChain(Simulator):
     """A simulator whose rollout is a row of stages: between them the tools are lifted off and put to the next stage's poses.
 
     The clay goes on as the stage before left it. A tool that would begin a stage inside it, since the stages before have changed,
-    is first moved out, against its first motion. The gradient takes that way, and the poses, as fixed numbers.
+    is first moved out, against its first motion or upwards. The gradient takes that way, and the poses, as fixed numbers.
 
     Args:
         simulator: Computes the stages; its `vjp` has to take `grad_final_state`.
@@ -141,27 +141,30 @@ def begin_stage(scene: Scene, state: State, poses: Tensor, actions: Tensor) -> S
 
 
 def moved_out(tool: Tool, pose: Tensor, motion: Tensor, particles: Tensor) -> Tensor:
-    """A tool's pose (8,), moved against its motion until it is free of the clay, within its bounds.
+    """A tool's pose (8,), moved out of the clay by the shorter of two ways: against its motion, or upwards.
 
     Args:
         tool: The tool.
         pose: Pose (8,).
-        motion: Where the tool goes first (up to 3 numbers), length units; upwards where it does not move.
+        motion: Where the tool goes first (up to 3 numbers), length units.
         particles: The clay (N, 3), length units.
 
     Returns:
-        The pose; unchanged where the tool is free already, or where there is no way out within `FARTHEST`.
+        The pose; unchanged where the tool is free already, or where there is no way out within `FARTHEST` and its bounds.
     """
-    direction = torch.nn.functional.pad(-motion.detach(), (0, 3 - len(motion)))
-    length = float(torch.linalg.vector_norm(direction))
-    direction = direction / length if length > 0.0 else direction.new_tensor([0.0, 1.0, 0.0])
-    way = {"reach": FARTHEST, "clearance": CLEARANCE, "least_depth": ROUNDING - CLEARANCE}
-    gone = float(exit_distances(tool, pose[3:7], pose[None, :3], direction, particles, **way)[0])
-    if not math.isfinite(gone):
-        return pose
-    found = pose.clone()
+    back = torch.nn.functional.pad(-motion.detach(), (0, 3 - len(motion)))
+    up = back.new_tensor([0.0, 1.0, 0.0])
+    length = float(torch.linalg.vector_norm(back))
+    # A tool that begins to rise would go back through the floor.
+    directions = [back / length, up] if length > 0.0 and float(back[1]) >= 0.0 else [up]
     lower, upper = pose.new_tensor(tool.lower_bound), pose.new_tensor(tool.upper_bound)
-    found[:3] = torch.minimum(torch.maximum(pose[:3] + gone * direction, lower), upper)
+    way = {"reach": FARTHEST, "clearance": CLEARANCE, "least_depth": ROUNDING - CLEARANCE}
+    found, shortest = pose, math.inf
+    for direction in directions:
+        gone = float(exit_distances(tool, pose[3:7], pose[None, :3], direction, particles, **way)[0])
+        position = pose[:3] + gone * direction
+        if gone < shortest and bool(((position >= lower) & (position <= upper)).all()):
+            found, shortest = torch.cat([position, pose[3:]]), gone
     return found
 
 

@@ -10,6 +10,7 @@ from backend_cases import BACKENDS, CASES, actions_for, backend_class, stirred
 
 from cpdeform.core.clearance import CLEARANCE
 from cpdeform.core.errors import CapabilityError, InputError
+from cpdeform.core.scene import ToolSphere
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.simulator import Simulator, differentiable_rollout
 from cpdeform.planning.chain import SimulatorChain, begin_stage, moved_out
@@ -106,6 +107,32 @@ def test_a_tool_inside_the_clay_is_moved_out_against_its_motion() -> None:
     assert torch.equal(found[[0, 2, 3, 4, 5, 6, 7]], pose[[0, 2, 3, 4, 5, 6, 7]])
     assert float(found[1]) > float(pose[1])
     assert torch.equal(moved_out(tool, found, torch.tensor([0.0, -0.01, 0.0]), clay), found)
+
+
+@pytest.mark.parametrize(
+    ("place", "motion", "way"),
+    [
+        # In the middle of a slab upwards is nearer than back, at its side back.
+        ((0.5, 0.33, 0.5), (0.01, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        ((0.36, 0.31, 0.5), (0.01, 0.0, 0.0), (-1.0, 0.0, 0.0)),
+        # Back from a rise would be down through the floor; a tool at rest goes up.
+        ((0.5, 0.33, 0.5), (0.0, 0.01, 0.0), (0.0, 1.0, 0.0)),
+        ((0.5, 0.33, 0.5), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ],
+)
+def test_the_shorter_way_out_is_taken(place, motion, way) -> None:
+    axes = [torch.linspace(low, high, count) for low, high, count in ((0.35, 0.65, 61), (0.3, 0.36, 13), (0.35, 0.65, 61))]
+    clay = torch.cartesian_prod(*axes)
+    tool = ToolSphere(radius=0.03, position=place, action_scale=(0.01, 0.01, 0.01))
+    pose = torch.tensor([*place, 1.0, 0.0, 0.0, 0.0, 0.0])
+    found = moved_out(tool, pose, torch.tensor(motion), clay)
+    assert float(signed_distance(tool, found, clay).min()) >= CLEARANCE - 1e-6
+    gone = found[:3] - pose[:3]
+    torch.testing.assert_close(gone / gone.norm(), torch.tensor(way), atol=1e-5, rtol=0.0)
+    assert float(gone.norm()) < 0.065
+    # Where its bounds let it go neither way, it stays.
+    bounded = tool.model_copy(update={"lower_bound": place, "upper_bound": place})
+    assert torch.equal(moved_out(bounded, pose, torch.tensor(motion), clay), pose)
 
 
 def test_what_cannot_be_chained_is_refused() -> None:

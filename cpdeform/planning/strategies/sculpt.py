@@ -35,8 +35,8 @@ MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
 SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
 
-TRIED = 4
-"""Plans of a coarser model that are tried on the scene itself."""
+TRIED = 8
+"""Touches that are polished on a coarser grid, and then tried on the scene itself."""
 
 
 class StrategySculpt(Strategy):
@@ -185,8 +185,8 @@ def _parts(stages: range, size: int) -> list[range]:
 def searching_coarsely(planner: Planner) -> Planner:
     """A planner that looks for touches in a coarser model of the scene, where there is one and the loss is made for it.
 
-    On a coarser grid the first step of polishing is taken there, too, and the best plans are tried on the scene itself. With fewer
-    particles on the same grid they are only screened: there the gradients save little.
+    On a coarser grid the best of them are polished there first, and then tried on the scene itself. With fewer particles on the
+    same grid they are only screened: there the gradients save little.
     """
     objective = planner.objective
     model = CoarseModel.of(planner.simulator, objective) if isinstance(objective, ObjectiveShape) else None
@@ -198,7 +198,8 @@ def searching_coarsely(planner: Planner) -> Planner:
         if isinstance(phase, PhaseScreening):
             phases.append(dataclasses.replace(phase, coarse=model))
         elif isinstance(phase, PhasePolish) and phase.exclusive and coarser_grid:
-            phases += [dataclasses.replace(phase, coarse=model), PhaseTrial(keep=TRIED)]
+            on_model = dataclasses.replace(phase, keep=TRIED, coarse=model)
+            phases += [on_model, PhaseTrial(keep=TRIED), phase]
         else:
             phases.append(phase)
     return dataclasses.replace(planner, phases=phases)
