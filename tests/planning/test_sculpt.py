@@ -16,7 +16,6 @@ from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.choice import MOST_ALIKE
 from cpdeform.planning.phases.polish import PhasePolish
 from cpdeform.planning.phases.screening import PhaseScreening
-from cpdeform.planning.phases.trial import PhaseTrial
 from cpdeform.planning.result import Status
 from cpdeform.planning.strategies.sculpt import StrategySculpt
 from cpdeform.run.deform import deform
@@ -67,35 +66,6 @@ def test_variations_of_one_touch_do_not_take_all_places():
     assert bench.asked == [1.0, 2.0, 4.0]
     with pytest.raises(InputError, match="keep: got 0"):
         PhasePolish(keep=0, optimizer=TrajectoryOptimizer())
-
-
-class Trials:
-    """Rolls out what it is given: each loss is higher than was thought, one is not finite."""
-
-    def rollout_losses(self, chosen, objective, *, phase):
-        return torch.tensor([float("nan") if candidate.loss == 2.0 else candidate.loss + 10.0 for candidate in chosen])
-
-
-def test_only_plans_that_were_tried_stay_in_the_race():
-    before = candidates([3.0, 1.0, float("inf"), 2.0, 4.0])
-    after = PhaseTrial(keep=3).run(Trials(), before)
-    assert [candidate.loss for candidate in after] == [13.0, 11.0, float("inf"), float("inf"), float("inf")]
-    assert PhaseTrial(keep=3).run(Trials(), candidates([float("nan")]))[0].loss == float("inf")
-    with pytest.raises(InputError, match="keep: got 0"):
-        PhaseTrial(keep=0)
-
-
-class Coarse:
-    """Stands for a coarse model."""
-
-    def minimize(self, bench, chosen, optimizer, *, phase):
-        return bench.minimize(chosen, optimizer, None, phase=f"{phase}, coarsely")
-
-
-def test_polishing_may_go_by_a_coarser_model():
-    polish = PhasePolish(keep=1, optimizer=TrajectoryOptimizer(iterations=1), coarse=Coarse(), exclusive=True)
-    after = polish.run(Bench(0.5), candidates([3.0, 1.0]))
-    assert [candidate.loss for candidate in after] == [float("inf"), 0.5]
 
 
 def test_a_run_by_touches(task):

@@ -58,16 +58,10 @@ class ObjectiveShape(Objective):
         if not (cost > 0.0 and self._misplaced_start > 0.0):
             raise InputError("start", came="the goal itself", expected="a shape that differs from the goal")
 
-    def rebased(self, *, goal: Tensor, start: Tensor, scene: Scene | None = None) -> ObjectiveShape:
-        """The same objective for another goal (M, 3) and another start (N, 3), length units, such as those at rest.
-
-        Args:
-            goal: Goal particles.
-            start: Particles where the run begins.
-            scene: Another scene, such as one on a coarser grid; defaults to the same.
-        """
+    def rebased(self, *, goal: Tensor, start: Tensor) -> ObjectiveShape:
+        """The same objective for another goal (M, 3) and another start (N, 3), length units, such as those at rest."""
         transport = self._transport.with_goal(goal.to(self._transport.goal))
-        return ObjectiveShape(transport, scene or self._scene, goal, start, density_weight=self._weight)
+        return ObjectiveShape(transport, self._scene, goal, start, density_weight=self._weight)
 
     def evaluate(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> ObjectiveResult:
         """Loss and gradient of each world; the transport term is warm-started."""

@@ -9,7 +9,6 @@ import torch
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate
-from cpdeform.planning.coarse import CoarseModel
 from cpdeform.planning.effort import Effort
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.choice import best_unlike
@@ -35,7 +34,6 @@ class PhasePolish(Phase):
     keep: int
     optimizer: TrajectoryOptimizer
     exclusive: bool = False
-    coarse: CoarseModel | None = None
     name: str = "polish"
 
     def __post_init__(self) -> None:
@@ -44,19 +42,14 @@ class PhasePolish(Phase):
 
     def effort(self, candidates: int) -> Effort:
         """See `Phase`."""
-        descent = self.optimizer.effort(min(self.keep, candidates))
-        return descent if self.coarse is None else Effort(rollouts=descent.gradients)
+        return self.optimizer.effort(min(self.keep, candidates))
 
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
         """All candidates, the best of them with better plans; unless `exclusive`, a plan is never worse than before."""
         chosen = best_unlike(candidates, self.keep)
         if not chosen:
             return candidates
-        polished = [candidates[number] for number in chosen]
-        if self.coarse is None:
-            found = bench.minimize(polished, self.optimizer, None, phase=self.name)
-        else:
-            found = self.coarse.minimize(bench, polished, self.optimizer, phase=self.name)
+        found = bench.minimize([candidates[number] for number in chosen], self.optimizer, None, phase=self.name)
         result = list(candidates)
         if self.exclusive:
             result = [dataclasses.replace(candidate, loss=torch.inf) for candidate in candidates]

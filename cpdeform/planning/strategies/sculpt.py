@@ -23,7 +23,6 @@ from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.phase import Phase
 from cpdeform.planning.phases.polish import PhasePolish
 from cpdeform.planning.phases.screening import PhaseScreening
-from cpdeform.planning.phases.trial import PhaseTrial
 from cpdeform.planning.pruner import PrunerNone
 from cpdeform.planning.rest import rest, settle_goal
 from cpdeform.planning.result import Revision, StageResult, Status
@@ -34,9 +33,6 @@ MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
 
 SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
-
-TRIED = 8
-"""Touches that are polished on a coarser grid, and then tried on the scene itself."""
 
 
 class StrategySculpt(Strategy):
@@ -59,7 +55,7 @@ class StrategySculpt(Strategy):
         joint_iterations: Gradient evaluations of each of them in that.
         joint_every: Stages after which those found so far are polished together on the way.
         interim_iterations: Gradient evaluations of each of them in that.
-        coarse: Whether touches are looked for in a coarser model of the scene, where there is one; see `cpdeform.planning.coarse`.
+        coarse: Whether touches are screened with fewer particles, where there are many; see `cpdeform.planning.coarse`.
         idle: Stages without a gain in a row after which the run ends.
 
     Raises:
@@ -127,7 +123,7 @@ class StrategySculpt(Strategy):
         """One touch a stage, from rest to rest, some polished together; a few stages without a gain do not end the run."""
         planner, start = from_rest(planner, start)
         if self.coarse:
-            planner = searching_coarsely(planner)
+            planner = screened_coarsely(planner)
         finished: list[StageResult] = []
         end = start.first_stage + start.stages
         for first in range(start.first_stage, end, self.together):
@@ -182,26 +178,11 @@ def _parts(stages: range, size: int) -> list[range]:
     return [stages[first : first + size] for first in range(0, len(stages), size)]
 
 
-def searching_coarsely(planner: Planner) -> Planner:
-    """A planner that looks for touches in a coarser model of the scene, where there is one and the loss is made for it.
-
-    On a coarser grid the best of them are polished there first, and then tried on the scene itself. With fewer particles on the
-    same grid they are only screened: there the gradients save little.
-    """
+def screened_coarsely(planner: Planner) -> Planner:
+    """A planner whose screening goes by fewer particles, where there are many and the loss is made for it."""
     objective = planner.objective
     model = CoarseModel.of(planner.simulator, objective) if isinstance(objective, ObjectiveShape) else None
-    if model is None:
-        return planner
-    coarser_grid = model.simulator.scene.grid_size < planner.task.scene.grid_size
-    phases: list[Phase] = []
-    for phase in planner.phases:
-        if isinstance(phase, PhaseScreening):
-            phases.append(dataclasses.replace(phase, coarse=model))
-        elif isinstance(phase, PhasePolish) and phase.exclusive and coarser_grid:
-            on_model = dataclasses.replace(phase, keep=TRIED, coarse=model)
-            phases += [on_model, PhaseTrial(keep=TRIED), phase]
-        else:
-            phases.append(phase)
+    phases = [dataclasses.replace(phase, coarse=model) if isinstance(phase, PhaseScreening) else phase for phase in planner.phases]
     return dataclasses.replace(planner, phases=phases)
 
 
