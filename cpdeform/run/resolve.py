@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
+from torch import Tensor
+
 from cpdeform.core.errors import InputError, PluginError
 from cpdeform.core.forking import prepare_for_forks
 from cpdeform.core.machine import available_cores
@@ -220,12 +222,24 @@ class ResolvedRun:
         with self.executor() as executor:
             planner = self.planner(observers, executor=executor)
             if on_estimate is not None:
-                on_estimate(self._estimate_or_none(planner))
+                told = _Estimating(lambda: on_estimate(self._estimate_or_none(planner)))
+                planner = dataclasses.replace(planner, observers=(*planner.observers, told))
             found = planner.run(
                 stages=self.configuration.stages, state=self.state, first_stage=self.first_stage, previous=self.previous
             )
         fields = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
         return RunResult(**fields, configuration=self.configuration, resumed_from=self.record, origins=self.origins)
+
+
+class _Estimating(Observer):
+    """Tells what a run will take when it starts: once all is checked, so that nothing is measured for a run that cannot be."""
+
+    def __init__(self, tell: Callable[[], None]) -> None:
+        self._tell = tell
+
+    def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
+        """Tell."""
+        self._tell()
 
 
 def resolve(

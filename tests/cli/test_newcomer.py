@@ -91,7 +91,8 @@ def test_quiet(directory):
 def test_progress_tells_parts_and_batches(directory, monkeypatch):
     monkeypatch.setattr("cpdeform.cli.progress.SECONDS_BETWEEN_LINES", 0.0)
     lines = invoke("run", "shift.yaml", *PARTS, "--out", "run").stderr.splitlines()
-    assert lines[0] == "stage 1: transport"
+    assert lines[0].startswith("estimate: ")
+    assert lines[1] == "stage 1: transport"
     assert sum(line.startswith("stage 1, batch 1, iteration") for line in lines) == 3
     assert "stage 2: transport" in lines
     assert any(line.startswith("stage 2, batch 1, iteration 1/3") for line in lines)

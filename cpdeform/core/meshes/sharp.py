@@ -10,7 +10,6 @@ import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d, maximum_filter
 
 from cpdeform.core.meshes.mesh import Array, Mesh, geometry_library
 from cpdeform.core.meshes.triangles import TRIANGLE_SIZE, Indices, neighbours, signed_distance, triangle_numbers
@@ -100,6 +99,8 @@ def find_sharp_cells(mesh: Mesh, coefficients: Array, spacing: float) -> SharpCe
         coefficients: Coefficients (X, Y, Z) of the spline through its signed distances; the grid's middle is the origin.
         spacing: Distance between nodes.
     """
+    from scipy.ndimage import maximum_filter
+
     rounded = _rounded(coefficients, spacing)
     cells = np.flatnonzero(rounded)
     if not len(cells):
@@ -129,6 +130,8 @@ def _rounded(coefficients: Array, spacing: float) -> NDArray[np.bool_]:
 
     It is looked at in the middles of cells, of their faces and edges, and at their corners.
     """
+    from scipy.ndimage import correlate1d, maximum_filter
+
     value = {False: [0.125, 0.75, 0.125], True: [0.5, 0.5, 0.0]}
     slope = {False: [-0.5, 0.0, 0.5], True: [-1.0, 1.0, 0.0]}
     error = np.zeros(coefficients.shape)
