@@ -24,11 +24,11 @@ run: $(NATIVE)
 
 test: $(NATIVE)
 	$(BIN)/$(PYTEST)
-	cd plugins/cpdeform-example && ../../$(BIN)/$(PYTEST)
-	cd plugins/cpdeform-gymnasium && ../../$(BIN)/$(PYTEST)
-	cd plugins/cpdeform-baselines && ../../$(BIN)/$(PYTEST)
+	cd plugins/cpdeform-example && ../../$(BIN)/python -m pytest
+	cd plugins/cpdeform-gymnasium && ../../$(BIN)/python -m pytest
+	cd plugins/cpdeform-baselines && ../../$(BIN)/python -m pytest
 ifneq ($(COMPILER),)
-	cd plugins/cpdeform-native && ../../$(BIN)/$(PYTEST)
+	cd plugins/cpdeform-native && ../../$(BIN)/python -m pytest
 endif
 
 quick: $(NATIVE)
