@@ -128,16 +128,7 @@ class Planner:
         for observer in self.observers:
             observer.run_started(self.task, goal, self.names, self.seed)
         start = Start(state=state, goal=goal, first_stage=first_stage, stages=count, previous=tuple(previous))
-        results: list[StageResult] = []
-        for found in (self.loop or contact_points_discovery)(self, start):
-            if isinstance(found, Revision):
-                results[-len(found.results) :] = found.results
-                for observer in self.observers:
-                    observer.stages_revised(found)
-            else:
-                results.append(found)
-                for observer in self.observers:
-                    observer.stage_finished(found)
+        results = self._follow(start)
         metric = evaluate_metric(self.task, start=scene_start.position[0], final=results[-1].state.position[0], goal=goal)
         finished = DeformResult(
             task=self.task,
@@ -158,6 +149,20 @@ class Planner:
         for observer in self.observers:
             observer.run_finished(finished)
         return finished
+
+    def _follow(self, start: Start) -> list[StageResult]:
+        """Every stage that the loop leads to, with its latest plan; observers are told as it goes on."""
+        results: list[StageResult] = []
+        for found in (self.loop or contact_points_discovery)(self, start):
+            if isinstance(found, Revision):
+                results[-len(found.results) :] = found.results
+                for observer in self.observers:
+                    observer.stages_revised(found)
+            else:
+                results.append(found)
+                for observer in self.observers:
+                    observer.stage_finished(found)
+        return results
 
     def stage(
         self,

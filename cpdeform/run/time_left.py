@@ -40,7 +40,7 @@ class TimeLeft:
     def stage_finished(self) -> None:
         """A stage is over."""
         now = self._clock()
-        # Stages whose results come together, as those that were polished together, share their time.
+        # Stages whose results come together, as those of a beam, share their time.
         begin = self._begin + sum(self._finished)
         self._finished.append(max(0.0, now - begin))
         self._stage_begin, self._gradients = now, 0
