@@ -109,6 +109,10 @@ class Worker:
         function: Does a job; defaults to what the plugins register under the sweep's kind.
         observe: Gives observers of a job.
         own_process: Whether this process does nothing else.
+
+    Attributes:
+        ending: Whether this process has been told to end. A signal's handler sets it before it raises `SystemExit`; one that a job
+            raises of its own accord is the job's failure.
     """
 
     def __init__(
@@ -126,6 +130,7 @@ class Worker:
         self._function: JobFunction = function or load_registry().load("job", queue.head.kind)
         self._observe = observe or _unobserved
         self._own_process = own_process
+        self.ending = False
         self._names = self.settings.own(queue.names())
         self._left: Iterator[str] = iter(())
         if queue.head.threads is not None:
@@ -178,6 +183,8 @@ class Worker:
                 context = JobContext(job=job, sweep=self.queue.directory, directory=claim.attempt, observers=observers)
                 figures = self._function(context)
         except (Exception, SystemExit) as error:
+            if self.ending:
+                raise
             outcome, figures = FAILED, {"reason": reason_of(error)}
         if not claim.held:
             shutil.rmtree(claim.attempt, ignore_errors=True)

@@ -184,6 +184,22 @@ def test_a_job_that_ends_its_process_fails(tmp_path):
     assert {name: content.get("reason") for name, content in queue.outcomes()} == {"job-000": "SystemExit: 0", "job-001": None}
 
 
+def test_a_worker_that_is_told_to_end_gives_its_job_back(tmp_path):
+    """As submitit does before its time is over: its signal's handler ends the process."""
+    queue = make(tmp_path, 1)
+    worker = Worker(queue, WorkSettings(), function=lambda context: told())
+
+    def told() -> dict[str, Any]:
+        worker.ending = True
+        sys.exit(144)
+
+    with pytest.raises(SystemExit):
+        next(worker.work())
+    status = sweep_status(queue)
+    assert (status.waiting, status.failed, status.running) == (1, 0, 0)
+    assert work(queue) == ["job-000"]
+
+
 def test_a_job_that_takes_its_directory_away_is_done(tmp_path):
     queue = make(tmp_path, 1)
     assert work(queue, lambda context: context.directory.rmdir() or {}) == ["job-000"]

@@ -43,14 +43,21 @@ class SlurmWorker:
 
     def __init__(self, directory: str, settings: WorkSettings) -> None:
         self.directory, self.settings = directory, settings
+        self._worker: Worker | None = None
 
     def __call__(self) -> int:
         """Work; how many jobs were done."""
-        return sum(1 for _ in Worker(Queue(Path(self.directory)), self.settings, own_process=True).work())
+        self._worker = Worker(Queue(Path(self.directory)), self.settings, own_process=True)
+        return sum(1 for _ in self._worker.work())
 
     def checkpoint(self) -> DelayedSubmission:
-        """What to queue again: the same, since the directory holds all that there is to know."""
-        return DelayedSubmission(self)
+        """What to queue again: the same, since the directory holds all that there is to know.
+
+        Submitit ends the process right after it.
+        """
+        if self._worker is not None:
+            self._worker.ending = True
+        return DelayedSubmission(SlurmWorker(self.directory, self.settings))
 
 
 class EngineSlurm(Engine):
