@@ -33,6 +33,7 @@ METHODS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "cpdeform": {"placer": "transport"},
         "tuned": {"placer": "transport", "strategy": "tuned"},
+        "sculpt": {"strategy": "sculpt"},
         "paper": {"placer": "transport", "strategy": "paper"},
         "fixed": {"placer": "fixed"},
         "random": {"placer": "random"},
@@ -43,8 +44,9 @@ METHODS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "sampled-gradients": {"strategy": "sampled-gradients"},
     }
 )
-"""What each method sets: this project's method, the same with settings tuned for each of the paper's tasks, Algorithm 1 to the
-letter, PlasticineLab's protocol, the paper's ablation, and the searches of the distribution cpdeform-baselines."""
+"""What each method sets: this project's method, the same with settings tuned for each of the paper's tasks, many touches
+from rest to rest, Algorithm 1 to the letter, PlasticineLab's protocol, the paper's ablation, and the searches of the
+distribution cpdeform-baselines."""
 
 REFERENCE, BASELINE = "cpdeform", "fixed"
 """With equal evaluations the second gets as many as the first one used."""

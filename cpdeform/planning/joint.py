@@ -47,8 +47,8 @@ def polish_jointly(planner: Planner, results: Sequence[StageResult], optimizer: 
         return list(results)
     begun = time.perf_counter()
     found = _minimize(planner, planned, optimizer)
-    executed = _execute(planner, planned, found.actions)
-    if executed is None or not executed[-1].loss < planned[-1].loss:
+    executed = _execute(planner, planned, found.actions) if found.gained else None
+    if executed is None:
         executed = planned
     seconds = (time.perf_counter() - begun) / len(planned)
     polished = iter([_accounted(result, seconds, found, last=result is executed[-1]) for result in executed])
@@ -75,6 +75,11 @@ class _Descent:
     gradients: int
     history: tuple[Iteration, ...]
     interruption: KeyboardInterrupt | None = None
+
+    @property
+    def gained(self) -> bool:
+        """Whether the best plan is better than the first one, by the loss of the whole row: its end and what its way costs."""
+        return bool(self.history) and bool(self.history[-1].best_loss[0] < self.history[0].loss[0])
 
 
 def _minimize(planner: Planner, planned: Sequence[StageResult], optimizer: TrajectoryOptimizer) -> _Descent:

@@ -129,7 +129,8 @@ def make_objective(
     if options.kind == "transport":
         return transport
     start = simulator.initial_state(batch_size=1).position[0]
-    return ObjectiveShape(transport, task.scene, goal, start, density_weight=options.density_weight)
+    weights = {"density_weight": options.density_weight, "collision_weight": options.collision_weight}
+    return ObjectiveShape(transport, task.scene, goal, start, **weights)
 
 
 def make_refinement(

@@ -112,6 +112,29 @@ def test_a_polish_that_gains_nothing_changes_no_plan(task):
         assert (old.loss, old.gradient_evaluations + 1) == (new.loss, new.gradient_evaluations)
 
 
+class Toll(Bend):
+    """The same, and a toll for the tools' way, summed over all steps."""
+
+    def loss(self, positions, tool_poses):
+        return super().loss(positions, tool_poses) + 0.5 * tool_poses.diff(dim=1)[..., 0, 0].abs().sum(dim=-1)
+
+
+def test_what_the_whole_row_gains_counts(task):
+    """Both stages' ways are paid for: the polish may raise the last stage's loss where it lowers that of the row."""
+    parts = dataclasses.replace(planner(task), objective=Toll())
+    before = parts.run(stages=2).stages
+    after = polish_jointly(parts, before, OPTIMIZER)
+    chain = SimulatorChain(parts.simulator, poses=torch.stack([stage.candidates[stage.best].proposal.pose for stage in before]))
+
+    def whole(stages):
+        plan = torch.cat([stage.actions for stage in stages])[None]
+        return float(parts.objective.losses(chain.rollout(before[0].state_before, plan))[0])
+
+    assert whole(after) < whole(before)
+    losses = [float(iteration.best_loss[0]) for iteration in after[-1].history if iteration.phase == PHASE]
+    assert whole(after) == pytest.approx(losses[-1])
+
+
 class Interrupt(Observer):
     """Control-C in the second iteration of the joint polish."""
 

@@ -1,4 +1,4 @@
-"""Transport for the way, misplaced mass for the shape."""
+"""Transport for the way, misplaced mass for the shape, and tools that stay free of the floor and of each other."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.objective import Objective, ObjectiveResult
 from cpdeform.core.scene import Scene
 from cpdeform.core.simulator import Trajectory
+from cpdeform.planning.objectives.collisions import ToolCollisions
 from cpdeform.planning.objectives.mass import mass_grid
 from cpdeform.planning.objectives.transport import ObjectiveTransport
 
@@ -20,6 +21,9 @@ SCALES = (1.0, 0.625, 0.375)
 LEAST_NODES = 8
 """The least nodes of such a grid."""
 
+COLLISION_WEIGHT = 0.05
+"""What a tool that is one cell below the floor, or inside another one, for one environment step adds to the loss."""
+
 
 class ObjectiveShape(Objective):
     """Transport cost and the share of misplaced mass at several scales, each over its value where the run begins.
@@ -27,6 +31,9 @@ class ObjectiveShape(Objective):
     Transport alone leads clay to where it is missing, but hardly minds crumbs and holes. The misplaced share of the mass,
     sum |m - m*| / (2 sum m*) of node masses m and those of the goal m*, sees these, and only these: it looks no farther than a
     node's neighbours, hence the coarser grids. The loss is 1 + `density_weight` at the start and 0 for the goal itself.
+
+    Added to it is `collision_weight` times `cpdeform.planning.objectives.collisions.ToolCollisions.cost`, which no plan has that a
+    robot could execute. The floor is the height of the lowest particle at the start.
 
     Attributes:
         goal: Goal particles (M, 3), length units.
@@ -38,17 +45,29 @@ class ObjectiveShape(Objective):
         goal: Goal particles (M, 3), length units.
         start: Particles (N, 3) where the run begins, length units.
         density_weight: Weight of the misplaced mass beside the transport.
+        collision_weight: Weight of a tool's depth below the floor or inside another tool, 1 / (cells of the grid * environment
+            steps); 0 lets tools pass through them.
 
     Raises:
-        InputError: The start is the goal already, or the weight is negative.
+        InputError: The start is the goal already, or a weight is negative.
     """
 
     def __init__(
-        self, transport: ObjectiveTransport, scene: Scene, goal: Tensor, start: Tensor, *, density_weight: float = 1.0
+        self,
+        transport: ObjectiveTransport,
+        scene: Scene,
+        goal: Tensor,
+        start: Tensor,
+        *,
+        density_weight: float = 1.0,
+        collision_weight: float = COLLISION_WEIGHT,
     ) -> None:
-        if not 0.0 <= density_weight < float("inf"):
-            raise InputError("density_weight", came=str(density_weight), expected="a finite number of at least 0")
+        for name, weight in (("density_weight", density_weight), ("collision_weight", collision_weight)):
+            if not 0.0 <= weight < float("inf"):
+                raise InputError(name, came=str(weight), expected="a finite number of at least 0")
         self._transport, self._weight, self._scene = transport, density_weight, scene
+        self._collision_weight = collision_weight
+        self._collisions = ToolCollisions(scene, floor=float(start[:, 1].min())) if collision_weight else None
         self.goal, self.start = goal.detach(), start.detach()
         self._scenes = [scene.model_copy(update={"grid_size": max(LEAST_NODES, round(part * scene.grid_size))}) for part in SCALES]
         self._goals = [_shares(goal.detach(), scale) for scale in self._scenes]
@@ -61,7 +80,8 @@ class ObjectiveShape(Objective):
     def rebased(self, *, goal: Tensor, start: Tensor) -> ObjectiveShape:
         """The same objective for another goal (M, 3) and another start (N, 3), length units, such as those at rest."""
         transport = self._transport.with_goal(goal.to(self._transport.goal))
-        return ObjectiveShape(transport, self._scene, goal, start, density_weight=self._weight)
+        weights = {"density_weight": self._weight, "collision_weight": self._collision_weight}
+        return ObjectiveShape(transport, self._scene, goal, start, **weights)
 
     def evaluate(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> ObjectiveResult:
         """Loss and gradient of each world; the transport term is warm-started."""
@@ -73,20 +93,25 @@ class ObjectiveShape(Objective):
         factor = self._weight / self._misplaced_start
         gradient = result.grad_positions / self._cost_start
         gradient[:, -1] += factor * slope
-        poses = result.grad_tools
-        return ObjectiveResult(
-            loss=result.loss / self._cost_start + factor * misplaced.detach().to(result.loss),
-            grad_positions=gradient,
-            grad_tools=None if poses is None else poses / self._cost_start,
-            warm=result.warm,
-        )
+        loss = result.loss / self._cost_start + factor * misplaced.detach().to(result.loss)
+        poses = None if result.grad_tools is None else result.grad_tools / self._cost_start
+        if self._collisions is not None:
+            collisions, collision_slope = self._collisions.cost_and_gradient(trajectory.tool_poses)
+            loss = loss + self._collision_weight * collisions.to(loss)
+            if bool(collisions.any()):
+                collision_slope = self._collision_weight * collision_slope
+                poses = collision_slope if poses is None else poses + collision_slope
+        return ObjectiveResult(loss=loss, grad_positions=gradient, grad_tools=poses, warm=result.warm)
 
     def losses(self, trajectory: Trajectory, warm: Sequence[object] | None = None) -> Tensor:
         """Loss (B,) of each world alone."""
         transport = self._transport.losses(trajectory, warm)
         with torch.no_grad():
             misplaced = self._misplaced(trajectory.positions[:, -1].detach())
-        return transport / self._cost_start + (self._weight / self._misplaced_start) * misplaced.to(transport)
+            loss = transport / self._cost_start + (self._weight / self._misplaced_start) * misplaced.to(transport)
+            if self._collisions is not None:
+                loss = loss + self._collision_weight * self._collisions.cost(trajectory.tool_poses.detach()).to(loss)
+        return loss
 
     def _misplaced(self, positions: Tensor) -> Tensor:
         """Misplaced share (B,) of the mass of positions (B, N, 3), the mean over the scales."""

@@ -91,6 +91,25 @@ def test_losses_alone_are_the_same() -> None:
     assert torch.allclose(whole.losses(worlds), whole.evaluate(worlds).loss)
 
 
+def test_tools_below_the_floor_cost_what_lifting_them_saves() -> None:
+    """The lowest particle lies on the floor; the sphere of radius 0.03 is sunk by 0.01 at the end of one world."""
+    goal = start() + SHIFT
+    free, whole = (
+        ObjectiveShape(ObjectiveTransport(solver(), goal), SCENE, goal, start(), collision_weight=weight) for weight in (0.0, 0.2)
+    )
+    low, worlds = float(start()[:, 1].min()), path(start(), start())
+    worlds.tool_poses[0, 1, 0, 1] = low + 0.03 - 0.01
+    difference = whole.losses(worlds) - free.losses(worlds)
+    assert difference.tolist() == pytest.approx([0.2 * 0.01 * SCENE.grid_size, 0.0], rel=1e-6)
+    result = whole.evaluate(worlds)
+    assert torch.allclose(result.loss, whole.losses(worlds))
+    assert result.grad_tools is not None
+    assert float(result.grad_tools[0, 1, 0, 1]) == pytest.approx(-0.2 * SCENE.grid_size, rel=1e-6)
+    assert not result.grad_tools[1].any()
+    moved = whole.rebased(goal=goal, start=start())
+    assert torch.allclose(moved.losses(worlds), result.loss)
+
+
 def test_a_start_at_the_goal_is_refused() -> None:
     with pytest.raises(InputError, match="start: got the goal itself"):
         ObjectiveShape(ObjectiveTransport(solver(), start()), SCENE, start(), start())

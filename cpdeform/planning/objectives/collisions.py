@@ -1,0 +1,63 @@
+"""What a plan costs that no robot could execute: tools that reach below the floor or into each other."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cpdeform.core.rotation import rotate
+from cpdeform.core.scene import Scene
+from cpdeform.core.signed_distance import signed_distance
+from cpdeform.placement.tool import surface_points
+
+RESOLUTION = 9
+"""Points of the lattice along each axis that a tool's surface is sampled by; odd, so that a round tool's poles are among them."""
+
+
+class ToolCollisions:
+    """How deep movable tools reach below the floor and into other tools, summed over a plan's environment steps.
+
+    A tool's surface is a sample of points (`cpdeform.placement.tool.surface_points`); its depth is that of the deepest one, so that
+    the cost grows linearly with the depth, as an exact penalty does, and is zero for a plan that is free of collisions. Where the
+    scene itself puts a tool below the floor, only what lies deeper counts.
+
+    Args:
+        scene: Its tools.
+        floor: Height of the floor, length units.
+    """
+
+    def __init__(self, scene: Scene, *, floor: float) -> None:
+        self._scene, self._cell = scene, scene.node_distance
+        self._surfaces = [surface_points(tool, resolution=RESOLUTION) for tool in scene.tools]
+        self._floors = [floor] * len(scene.tools)
+        for index, tool in enumerate(scene.tools):
+            start = torch.tensor([*tool.position, *tool.rotation_wxyz], dtype=torch.float64)
+            self._floors[index] = min(floor, float(self._placed(index, start)[..., 1].min()))
+
+    def cost(self, tool_poses: Tensor) -> Tensor:
+        """Depths (B,) of tool poses (B, T+1, M, 8) in cells of the grid, summed over times and tools; differentiable."""
+        total = tool_poses.new_zeros(tool_poses.shape[0])
+        for index, tool in enumerate(self._scene.tools):
+            if not tool.movable:
+                continue
+            points = self._placed(index, tool_poses[..., index, :])
+            total = total + (self._floors[index] - points[..., 1].amin(dim=-1)).clamp(min=0.0).sum(dim=-1)
+            for other, neighbour in enumerate(self._scene.tools):
+                if other != index:
+                    gap = signed_distance(neighbour, tool_poses[..., other, :], points).amin(dim=-1)
+                    total = total + (-gap).clamp(min=0.0).sum(dim=-1)
+        return total / self._cell
+
+    def cost_and_gradient(self, tool_poses: Tensor) -> tuple[Tensor, Tensor]:
+        """`cost` (B,) and its gradient (B, T+1, M, 8)."""
+        poses = tool_poses.detach().requires_grad_()
+        with torch.enable_grad():
+            cost = self.cost(poses)
+            if not cost.requires_grad:
+                return cost.detach(), torch.zeros_like(poses)
+            (gradient,) = torch.autograd.grad(cost.sum(), poses)
+        return cost.detach(), gradient
+
+    def _placed(self, index: int, pose: Tensor) -> Tensor:
+        """Surface points (..., P, 3) of a tool with the poses (..., 7 or more)."""
+        return rotate(pose[..., None, 3:7], self._surfaces[index].to(pose)) + pose[..., None, :3]
