@@ -71,7 +71,8 @@ class MemoryGauge:
         self._forget()
 
     def _forget(self) -> None:
-        gc.collect()
+        # What was dropped lately, which is all that matters here: a full collection takes longer than a small run.
+        gc.collect(1)
         _trim()
         if self._on_cuda:
             torch.cuda.synchronize(self._device)

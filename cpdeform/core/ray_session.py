@@ -10,11 +10,12 @@ import ray
 from cpdeform.core.errors import InputError
 
 
-def connect(address: str | None) -> bool:
+def connect(address: str | None, *, option: str = "--address") -> bool:
     """Connect this process to a cluster, unless it is connected already.
 
     Args:
         address: Of the cluster, e.g. ``"auto"`` or ``"10.0.0.1:6379"``; None for that of ``RAY_ADDRESS``, else a new one here.
+        option: What the user gave it by, for the error.
 
     Returns:
         Whether it was this call that connected, so that the caller has to end it with `ray.shutdown`.
@@ -30,7 +31,7 @@ def connect(address: str | None) -> bool:
             ray.init(address=address, log_to_driver=False, logging_level="warning", include_dashboard=dashboard)
     except (ConnectionError, ValueError, RuntimeError) as error:
         came = "none that answers" if address is None else f"{address}, which does not answer"
-        raise InputError("--address", came=came, expected=f"the address of a Ray cluster ({str(error).splitlines()[0]})") from error
+        raise InputError(option, came=came, expected=f"the address of a Ray cluster ({str(error).splitlines()[0]})") from error
     return True
 
 

@@ -39,7 +39,7 @@ class ExecutorRay:
             if number < 1:
                 raise InputError(name, came=str(number), expected="at least 1")
         self.width, self.threads = workers, threads
-        self._own = connect(address)
+        self._own = connect(address, option="executor_options.address")
         environment = {"env_vars": thread_environment(threads)}
         self._task = ray.remote(_compute).options(num_cpus=threads, max_retries=TRIES - 1, runtime_env=environment)
         self._sent: tuple[object, str, Any] | None = None
