@@ -8,6 +8,8 @@ NATIVE := $(VENV)/.native
 DOCUMENTED := $(VENV)/.docs
 NATIVE_SOURCES := $(shell find plugins/cpdeform-native -name '*.cpp' -o -name '*.h' -o -name CMakeLists.txt -o -name pyproject.toml)
 COMPILER := $(shell command -v $${CXX:-c++} 2>/dev/null)
+# The longest first.
+PLUGINS := $(if $(COMPILER),native) baselines example gymnasium
 OUT ?= runs/first
 # Processes that the tests are shared out to; each file's tests stay together.
 WORKERS ?= 2
@@ -26,12 +28,11 @@ run: $(NATIVE)
 
 test: $(NATIVE)
 	$(BIN)/$(PYTEST)
-	cd plugins/cpdeform-example && ../../$(BIN)/python -m pytest
-	cd plugins/cpdeform-gymnasium && ../../$(BIN)/python -m pytest
-	cd plugins/cpdeform-baselines && ../../$(BIN)/python -m pytest
-ifneq ($(COMPILER),)
-	cd plugins/cpdeform-native && ../../$(BIN)/python -m pytest
-endif
+	$(MAKE) --no-print-directory --output-sync --jobs $(WORKERS) $(PLUGINS:%=test-%)
+
+# A plugin's own tests, such as `make test-native`.
+test-%: $(NATIVE)
+	cd plugins/cpdeform-$* && ../../$(BIN)/python -m pytest
 
 quick: $(NATIVE)
 	$(BIN)/$(PYTEST) -m "not slow"
