@@ -67,8 +67,7 @@ class ObjectiveConfiguration(FrozenModel):
             the share of misplaced mass at several scales, see `cpdeform.planning.objectives.shape`; ``"plasticinelab"``: density,
             distance and contact terms of node masses, summed over all steps.
         density_weight: (``"shape"``) Weight of the misplaced mass, dimensionless.
-        collision_weight: (``"shape"``) Weight of a tool's depth below the floor or inside another tool,
-            1 / (cells of the grid * environment steps).
+        collision_weight: (``"shape"``) Weight of tools below the floor or inside each other, dimensionless.
         points: Particles that the transport loss is computed on, a fixed random subset; None for all.
         blur: Entropic blur of the transport loss, length units; at least a millionth of the domain's edge.
         refresh: Solve from scratch every so many evaluations, warm-started between.
@@ -90,7 +89,7 @@ class ObjectiveConfiguration(FrozenModel):
     axis_scale: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (1.0, 1.0, 1.0)
     contact: ContactKind = "plasticinelab"
     density_weight: NonNegativeFloat = 1.0
-    collision_weight: NonNegativeFloat = 0.05
+    collision_weight: NonNegativeFloat = 0.02
 
 
 class RefinementConfiguration(FrozenModel):

@@ -17,13 +17,17 @@ RESOLUTION = 9
 class ToolCollisions:
     """How deep movable tools reach below the floor and into other tools, summed over a plan's environment steps.
 
-    A tool's surface is a sample of points (`cpdeform.placement.tool.surface_points`); its depth is that of the deepest one, so that
-    the cost grows linearly with the depth, as an exact penalty does, and is zero for a plan that is free of collisions. Where the
-    scene itself puts a tool below the floor, only what lies deeper counts.
+    A tool's surface is a sample of points (`cpdeform.placement.tool.surface_points`); its depth d is that of the deepest one, in
+    cells of the grid. It costs d^2 / 2 up to a cell and d - 1/2 beyond (Huber [1]_): a steeper cost near zero would drown the rest
+    of the gradient in the momentum of a descent wherever a tool slides along the floor. Where the scene itself puts a tool below
+    the floor, only what lies deeper counts.
 
     Args:
         scene: Its tools.
         floor: Height of the floor, length units.
+
+    References:
+        .. [1] Huber, "Robust Estimation of a Location Parameter", The Annals of Mathematical Statistics 35 (1964).
     """
 
     def __init__(self, scene: Scene, *, floor: float) -> None:
@@ -35,18 +39,22 @@ class ToolCollisions:
             self._floors[index] = min(floor, float(self._placed(index, start)[..., 1].min()))
 
     def cost(self, tool_poses: Tensor) -> Tensor:
-        """Depths (B,) of tool poses (B, T+1, M, 8) in cells of the grid, summed over times and tools; differentiable."""
+        """Cost (B,) of tool poses (B, T+1, M, 8), summed over times and tools; differentiable."""
         total = tool_poses.new_zeros(tool_poses.shape[0])
         for index, tool in enumerate(self._scene.tools):
             if not tool.movable:
                 continue
             points = self._placed(index, tool_poses[..., index, :])
-            total = total + (self._floors[index] - points[..., 1].amin(dim=-1)).clamp(min=0.0).sum(dim=-1)
+            total = total + self._of_heights(points[..., 1].amin(dim=-1) - self._floors[index])
             for other, neighbour in enumerate(self._scene.tools):
                 if other != index:
-                    gap = signed_distance(neighbour, tool_poses[..., other, :], points).amin(dim=-1)
-                    total = total + (-gap).clamp(min=0.0).sum(dim=-1)
-        return total / self._cell
+                    total = total + self._of_heights(signed_distance(neighbour, tool_poses[..., other, :], points).amin(dim=-1))
+        return total
+
+    def _of_heights(self, heights: Tensor) -> Tensor:
+        """Cost (B,) of heights (B, T+1), length units, where they are negative."""
+        depths = (-heights / self._cell).clamp(min=0.0)
+        return torch.nn.functional.huber_loss(depths, torch.zeros_like(depths), reduction="none").sum(dim=-1)
 
     def cost_and_gradient(self, tool_poses: Tensor) -> tuple[Tensor, Tensor]:
         """`cost` (B,) and its gradient (B, T+1, M, 8)."""

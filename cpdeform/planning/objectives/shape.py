@@ -21,8 +21,8 @@ SCALES = (1.0, 0.625, 0.375)
 LEAST_NODES = 8
 """The least nodes of such a grid."""
 
-COLLISION_WEIGHT = 0.05
-"""What a tool that is one cell below the floor, or inside another one, for one environment step adds to the loss."""
+COLLISION_WEIGHT = 0.02
+"""What a tool adds to the loss with each cell that it goes deeper below the floor or into another one, for one environment step."""
 
 
 class ObjectiveShape(Objective):
@@ -45,8 +45,7 @@ class ObjectiveShape(Objective):
         goal: Goal particles (M, 3), length units.
         start: Particles (N, 3) where the run begins, length units.
         density_weight: Weight of the misplaced mass beside the transport.
-        collision_weight: Weight of a tool's depth below the floor or inside another tool, 1 / (cells of the grid * environment
-            steps); 0 lets tools pass through them.
+        collision_weight: Weight of tools below the floor or inside each other, dimensionless; 0 lets them pass.
 
     Raises:
         InputError: The start is the goal already, or a weight is negative.

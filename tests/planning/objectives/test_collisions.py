@@ -15,6 +15,11 @@ FLOOR, CELL = 0.05, 1.0 / 64.0
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
+def cost(*depths: float) -> float:
+    """Of depths, length units."""
+    return sum(0.5 * (depth / CELL) ** 2 if depth < CELL else depth / CELL - 0.5 for depth in depths)
+
+
 def scene(*tools: dict) -> Scene:
     body = {"kind": "box", "position": (0.5, 0.1, 0.5), "widths": (0.1, 0.1, 0.1), "particle_count": 50}
     moves = {"action_scale": (0.01,) * 6}
@@ -38,8 +43,8 @@ def poses(*steps: list[tuple[float, ...]]) -> Tensor:
 
 def test_a_plan_that_is_free_of_collisions_costs_nothing() -> None:
     collisions = ToolCollisions(scene(sphere(0.4), sphere(0.6)), floor=FLOOR)
-    cost, gradient = collisions.cost_and_gradient(poses([(0.4, 0.081, 0.5), (0.461, 0.081, 0.5)]))
-    assert float(cost) == 0.0
+    found, gradient = collisions.cost_and_gradient(poses([(0.4, 0.081, 0.5), (0.461, 0.081, 0.5)]))
+    assert float(found) == 0.0
     assert not gradient.any()
 
 
@@ -49,22 +54,24 @@ def test_depth_below_the_floor_is_that_of_the_lowest_point_in_each_step(angle) -
     collisions = ToolCollisions(scene(plate()), floor=FLOOR)
     turn = (math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2))
     low = math.sin(angle) * 0.04 + math.cos(angle) * 0.02
-    steps = [[(0.5, FLOOR + low - depth, 0.5, *turn)] for depth in (-0.01, 0.004, 0.006)]
-    assert float(collisions.cost(poses(*steps))) == pytest.approx(0.01 / CELL, rel=1e-6)
+    steps = [[(0.5, FLOOR + low - depth, 0.5, *turn)] for depth in (-0.01, 0.004, 0.03)]
+    assert float(collisions.cost(poses(*steps))) == pytest.approx(cost(0.004, 0.03), rel=1e-6)
 
 
 def test_depth_in_another_tool_counts_for_each_tool_that_moves() -> None:
     both = poses([(0.4, 0.3, 0.5), (0.45, 0.3, 0.5)])
-    assert float(ToolCollisions(scene(sphere(0.4), sphere(0.6)), floor=FLOOR).cost(both)) == pytest.approx(0.02 / CELL, rel=0.02)
+    assert float(ToolCollisions(scene(sphere(0.4), sphere(0.6)), floor=FLOOR).cost(both)) == pytest.approx(
+        cost(0.01, 0.01), rel=0.04
+    )
     still = sphere(0.6, action_scale=())
-    assert float(ToolCollisions(scene(sphere(0.4), still), floor=FLOOR).cost(both)) == pytest.approx(0.01 / CELL, rel=0.02)
+    assert float(ToolCollisions(scene(sphere(0.4), still), floor=FLOOR).cost(both)) == pytest.approx(cost(0.01), rel=0.04)
 
 
 def test_what_the_scene_puts_below_the_floor_does_not_count_there() -> None:
     low = scene(sphere(0.4, position=(0.4, 0.06, 0.5)))
     collisions = ToolCollisions(low, floor=FLOOR)
     assert float(collisions.cost(poses([(0.4, 0.06, 0.5)]))) == pytest.approx(0.0, abs=1e-9)
-    assert float(collisions.cost(poses([(0.4, 0.05, 0.5)]))) == pytest.approx(0.01 / CELL, rel=1e-6)
+    assert float(collisions.cost(poses([(0.4, 0.05, 0.5)]))) == pytest.approx(cost(0.01), rel=1e-6)
 
 
 def test_gradient_equals_finite_differences() -> None:
@@ -72,8 +79,8 @@ def test_gradient_equals_finite_differences() -> None:
     turn, other = torch.tensor([0.9, 0.1, 0.3, 0.2]), torch.tensor([0.8, -0.3, 0.2, 0.1])
     first, second = (0.5, 0.05, 0.5, *(turn / turn.norm()).tolist()), (0.53, 0.056, 0.49, *(other / other.norm()).tolist())
     at = poses([first, second])
-    cost, gradient = collisions.cost_and_gradient(at)
-    assert float(cost) > 1.0
+    found, gradient = collisions.cost_and_gradient(at)
+    assert float(found) > 1.0
     direction = torch.randn(at.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     direction[..., 7] = 0.0
     step = 1e-7

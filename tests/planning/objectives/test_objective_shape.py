@@ -100,11 +100,11 @@ def test_tools_below_the_floor_cost_what_lifting_them_saves() -> None:
     low, worlds = float(start()[:, 1].min()), path(start(), start())
     worlds.tool_poses[0, 1, 0, 1] = low + 0.03 - 0.01
     difference = whole.losses(worlds) - free.losses(worlds)
-    assert difference.tolist() == pytest.approx([0.2 * 0.01 * SCENE.grid_size, 0.0], rel=1e-6)
+    assert difference.tolist() == pytest.approx([0.2 * 0.5 * (0.01 * SCENE.grid_size) ** 2, 0.0], rel=1e-6)
     result = whole.evaluate(worlds)
     assert torch.allclose(result.loss, whole.losses(worlds))
     assert result.grad_tools is not None
-    assert float(result.grad_tools[0, 1, 0, 1]) == pytest.approx(-0.2 * SCENE.grid_size, rel=1e-6)
+    assert float(result.grad_tools[0, 1, 0, 1]) == pytest.approx(-0.2 * 0.01 * SCENE.grid_size**2, rel=1e-6)
     assert not result.grad_tools[1].any()
     moved = whole.rebased(goal=goal, start=start())
     assert torch.allclose(moved.losses(worlds), result.loss)
