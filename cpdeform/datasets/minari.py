@@ -35,6 +35,8 @@ class MinariWriter:
             }
         )
         actions = box(-1.0, 1.0, sample.actions.shape[1:], np.float32)
+        # Minari joins a relative directory to itself.
+        directory = directory.resolve()
         directory.mkdir(parents=True, exist_ok=True)
         self._storage = MinariStorage.new(directory, observation_space=observations, action_space=actions, jpeg_encoding=False)
         self._storage.update_metadata({"dataset_id": name, "minari_version": minari.__version__, **fields})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 import subprocess
 from pathlib import Path
@@ -44,10 +45,11 @@ SETTINGS = DatasetSettings(
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> tuple[Queue, BuiltDataset]:
-    """A data set of two plans of two stages, not to be changed."""
+    """A data set of two plans of two stages, not to be changed; its directory is given relative to where the test runs."""
     queue = new_dataset(tmp_path_factory.mktemp("data") / "clay", SETTINGS, registry=load_registry())
     assert [outcome.outcome for outcome in Worker(queue).work()] == ["done", "done"]
-    return queue, build_dataset(queue, SETTINGS, name="clay")
+    relative = Queue(Path(os.path.relpath(queue.directory)))
+    return queue, dataclasses.replace(build_dataset(relative, SETTINGS, name="clay"), directory=queue.directory / "dataset")
 
 
 def records(queue: Queue) -> list[Any]:

@@ -20,7 +20,7 @@ class ToolCollisions:
     A tool's surface is a sample of points (`cpdeform.placement.tool.surface_points`); its depth d is that of the deepest one, in
     cells of the grid. It costs d^2 / 2 up to a cell and d - 1/2 beyond (Huber [1]_): a steeper cost near zero would drown the rest
     of the gradient in the momentum of a descent wherever a tool slides along the floor. Where the scene itself puts a tool below
-    the floor, only what lies deeper counts.
+    the floor, only what lies deeper counts. A tool that stands still costs nothing: it is taken away before the next stage.
 
     Args:
         scene: Its tools.
@@ -39,22 +39,25 @@ class ToolCollisions:
             self._floors[index] = min(floor, float(self._placed(index, start)[..., 1].min()))
 
     def cost(self, tool_poses: Tensor) -> Tensor:
-        """Cost (B,) of tool poses (B, T+1, M, 8), summed over times and tools; differentiable."""
+        """Cost (B,) of tool poses (B, T+1, M, 8), summed over the steps in which a tool moves, and the tools; differentiable."""
         total = tool_poses.new_zeros(tool_poses.shape[0])
         for index, tool in enumerate(self._scene.tools):
             if not tool.movable:
                 continue
-            points = self._placed(index, tool_poses[..., index, :])
-            total = total + self._of_heights(points[..., 1].amin(dim=-1) - self._floors[index])
+            path = tool_poses[..., index, :]
+            moves = (path.detach().diff(dim=1) != 0.0).any(dim=-1)
+            points = self._placed(index, path[:, 1:])
+            depths = [self._floors[index] - points[..., 1].amin(dim=-1)]
             for other, neighbour in enumerate(self._scene.tools):
                 if other != index:
-                    total = total + self._of_heights(signed_distance(neighbour, tool_poses[..., other, :], points).amin(dim=-1))
+                    depths.append(-signed_distance(neighbour, tool_poses[:, 1:, other], points).amin(dim=-1))
+            total = total + sum(self._of_depths(depth) * moves for depth in depths).sum(dim=-1)
         return total
 
-    def _of_heights(self, heights: Tensor) -> Tensor:
-        """Cost (B,) of heights (B, T+1), length units, where they are negative."""
-        depths = (-heights / self._cell).clamp(min=0.0)
-        return torch.nn.functional.huber_loss(depths, torch.zeros_like(depths), reduction="none").sum(dim=-1)
+    def _of_depths(self, depths: Tensor) -> Tensor:
+        """Cost of depths, length units; nothing where they are negative."""
+        cells = (depths / self._cell).clamp(min=0.0)
+        return torch.nn.functional.huber_loss(cells, torch.zeros_like(cells), reduction="none")
 
     def cost_and_gradient(self, tool_poses: Tensor) -> tuple[Tensor, Tensor]:
         """`cost` (B,) and its gradient (B, T+1, M, 8)."""

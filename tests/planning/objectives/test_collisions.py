@@ -35,10 +35,13 @@ def plate(**changes) -> dict:
 
 
 def poses(*steps: list[tuple[float, ...]]) -> Tensor:
-    """Poses (1, T+1, M, 8) of positions and quaternions."""
-    return torch.tensor(
-        [[[[*pose, *([] if len(pose) > 3 else UPRIGHT), 0.0] for pose in step] for step in steps]], dtype=torch.float64
-    )
+    """Poses (1, T+1, M, 8) of positions and quaternions in T steps, from where they would be without the first motion."""
+    whole = torch.tensor([[[*pose, *([] if len(pose) > 3 else UPRIGHT), 0.0] for pose in step] for step in steps]).double()
+    whole[..., :3] = torch.tensor([[pose[:3] for pose in step] for step in steps], dtype=torch.float64)
+    whole[..., 3:7] = torch.nn.functional.normalize(whole[..., 3:7], dim=-1)
+    before = whole[:1].clone()
+    before[..., 0] -= 0.001
+    return torch.cat([before, whole]).unsqueeze(0)
 
 
 def test_a_plan_that_is_free_of_collisions_costs_nothing() -> None:
@@ -74,6 +77,15 @@ def test_what_the_scene_puts_below_the_floor_does_not_count_there() -> None:
     assert float(collisions.cost(poses([(0.4, 0.05, 0.5)]))) == pytest.approx(cost(0.01), rel=1e-6)
 
 
+def test_a_tool_that_stands_still_costs_nothing() -> None:
+    """Wherever the stage before has left it. The other one pays for the step in which it moves into it, below the floor."""
+    collisions = ToolCollisions(scene(sphere(0.4), sphere(0.6)), floor=FLOOR)
+    still = poses([(0.4, 0.07, 0.5), (0.45, 0.07, 0.5)])[:, 1:].repeat(1, 4, 1, 1)
+    assert float(collisions.cost(still)) == 0.0
+    still[:, :2, 1, 2] += 0.2
+    assert float(collisions.cost(still)) == pytest.approx(cost(0.01, 0.01), rel=0.04)
+
+
 def test_gradient_equals_finite_differences() -> None:
     collisions = ToolCollisions(scene(plate(), plate()), floor=FLOOR)
     turn, other = torch.tensor([0.9, 0.1, 0.3, 0.2]), torch.tensor([0.8, -0.3, 0.2, 0.1])
@@ -83,6 +95,8 @@ def test_gradient_equals_finite_differences() -> None:
     assert float(found) > 1.0
     direction = torch.randn(at.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     direction[..., 7] = 0.0
+    # Of where the tools begin, only the motion counts.
+    assert not gradient[:, 0].any()
     step = 1e-7
     difference = (float(collisions.cost(at + step * direction)) - float(collisions.cost(at - step * direction))) / (2.0 * step)
     assert float((gradient * direction).sum()) == pytest.approx(difference, rel=1e-5)
