@@ -14,6 +14,7 @@ from rich.text import Text
 from torch import Tensor
 
 from cpdeform.core.task import Task
+from cpdeform.planning.joint import PHASE as JOINT_POLISH
 from cpdeform.planning.optimizer import SEARCH, Iteration
 from cpdeform.planning.result import Observer, Revision, StageResult
 from cpdeform.run.estimate import RunEstimate
@@ -39,8 +40,12 @@ class Progress(Observer):
         """Count batches anew in each stage."""
         if part == "transport":
             self._batch = 0
-            if self._time is not None:
-                self._time.stage_started()
+        if self._time is None:
+            return
+        if part == "transport":
+            self._time.stage_started()
+        elif part == JOINT_POLISH:
+            self._time.joint_started()
 
     def iteration_finished(self, stage: int, iteration: Iteration) -> None:
         """Count the gradients."""
@@ -55,6 +60,8 @@ class Progress(Observer):
 
     def stages_revised(self, revision: Revision) -> None:
         """Leave a line that stays."""
+        if self._time is not None:
+            self._time.joint_finished()
         self._print(_revision_line(revision) + self._time_text())
 
     def _time_text(self) -> str:
@@ -196,7 +203,7 @@ class ProgressLines(Progress):
 
 def estimate_line(estimate: RunEstimate) -> str:
     """What a run will take, in a line."""
-    least, most = estimate.effort.scaled(estimate.stages, estimate.stages).gradients
+    least, most = estimate.total.gradients
     memory = " to ".join(megabytes(count) for count in estimate.memory)
     work = f"stages {estimate.stages}, {least} to {most} gradient evaluations"
     return f"estimate: {duration_range(estimate.seconds)}, memory {memory} ({work}; pictures left out)"

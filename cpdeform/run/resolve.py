@@ -207,7 +207,9 @@ class ResolvedRun:
         """
         configuration = self.configuration
         effort = self.strategy.effort(stage_effort(planner))
-        return estimate_run(planner, stages=configuration.stages, workers=configuration.workers, effort=effort)
+        stages = configuration.stages or self.task.stage_count
+        joint = self.strategy.joint_efforts(planner.simulator, stages=stages)
+        return estimate_run(planner, stages=stages, workers=configuration.workers, effort=effort, joint=joint)
 
     def run(
         self, observers: Sequence[Observer] = (), *, on_estimate: Callable[[RunEstimate | None], None] | None = None
