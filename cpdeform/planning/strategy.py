@@ -48,9 +48,12 @@ class Strategy(abc.ABC):
 
     Attributes:
         keeps_limits: Whether plans keep to the limits that a task puts on its tools (`Task.limits`).
+        takes_optimizer: Whether phases use `Parts.optimizer`, which the options `optimizer.*` describe; otherwise who sets one of
+            them is told that it has no effect.
     """
 
     keeps_limits: ClassVar[bool] = True
+    takes_optimizer: ClassVar[bool] = True
 
     @abc.abstractmethod
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -61,6 +61,8 @@ class StrategySculpt(Strategy):
     Raises:
         InputError: An option is out of range.
     """
+
+    takes_optimizer: ClassVar[bool] = False
 
     def __init__(
         self,
