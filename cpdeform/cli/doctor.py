@@ -94,9 +94,10 @@ def _caches() -> dict[str, str]:
 
 
 def _text(found: dict[str, Any]) -> str:
+    from cpdeform.core.wording import counted
+
     versions = ", ".join(f"{name} {version or 'missing'}" for name, version in found["versions"].items())
-    cores = found["cores_at_hand"]
-    lines = [f"system    {found['platform']}, {cores} core{'' if cores == 1 else 's'} at hand", f"versions  {versions}"]
+    lines = [f"system    {found['platform']}, {counted(found['cores_at_hand'], 'core')} at hand", f"versions  {versions}"]
     for kind, flag in PARTS.items():
         choice = found["auto"][kind]
         lines.append(f"{kind}: auto takes {choice['name'] or 'nothing'} on the CPU ({choice['reason']})")

@@ -14,6 +14,7 @@ from rich.text import Text
 from torch import Tensor
 
 from cpdeform.core.task import Task
+from cpdeform.core.wording import counted
 from cpdeform.planning.joint import PHASE as JOINT_POLISH
 from cpdeform.planning.optimizer import SEARCH, Iteration
 from cpdeform.planning.result import Observer, Revision, StageResult
@@ -205,7 +206,7 @@ def estimate_line(estimate: RunEstimate) -> str:
     """What a run will take, in a line."""
     least, most = estimate.total.gradients
     memory = " to ".join(megabytes(count) for count in estimate.memory)
-    work = f"stages {estimate.stages}, {least} to {most} gradient evaluations"
+    work = f"{counted(estimate.stages, 'stage')}, {least} to {most} gradient evaluations"
     return f"estimate: {duration_range(estimate.seconds)}, memory {memory} ({work}; pictures left out)"
 
 
@@ -223,7 +224,7 @@ def _losses(iteration: Iteration) -> str:
 def _stage_line(result: StageResult) -> str:
     return (
         f"stage {result.index + 1}: {result.status.value.replace('_', ' ')}, loss {result.loss_before:.4g} -> {result.loss:.4g}, "
-        f"{len(result.candidates)} candidates, {result.seconds['total']:.1f} s"
+        f"{counted(len(result.candidates), 'candidate')}, {result.seconds['total']:.1f} s"
     )
 
 
