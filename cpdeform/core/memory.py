@@ -72,7 +72,7 @@ class MemoryGauge:
 
     def _forget(self) -> None:
         gc.collect()
-        _trim()
+        give_back()
         if self._on_cuda:
             torch.cuda.synchronize(self._device)
             torch.cuda.reset_peak_memory_stats(self._device)
@@ -128,7 +128,7 @@ def _highest_resident() -> int:
     return highest if sys.platform == "darwin" else highest * 1024
 
 
-def _trim() -> None:
+def give_back() -> None:
     """Have glibc give freed memory back to the system; other C libraries have nothing of the kind."""
     try:
         ctypes.CDLL(None).malloc_trim(0)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
+from cpdeform.core.memory import give_back
 from cpdeform.core.memory_limit import check_memory
 from cpdeform.planning.algorithm import Planner
 from cpdeform.planning.effort import Effort, JointEffort
@@ -121,9 +122,24 @@ def memory_bounds(held: int, needed: int) -> tuple[int, int]:
 
     Args:
         held: Bytes that the process holds before.
-        needed: Bytes that rollouts and gradients of the largest batch hold.
+        needed: Bytes that rollouts and gradients hold, see `largest_need`.
     """
     return held + int(0.8 * needed), held + int(1.2 * needed) + LIBRARIES
+
+
+def largest_need(planner: Planner, *, worlds: int, joint: Sequence[JointEffort] = ()) -> int:
+    """The most bytes that rollouts and gradients hold.
+
+    Batches shrink as candidates are dropped, and fewer worlds may take more: where their whole history fits, it is kept.
+
+    Args:
+        planner: The run's parts.
+        worlds: Worlds of the largest batch.
+        joint: What is computed over several stages together, one world each.
+    """
+    simulator, steps = planner.simulator, planner.task.rollout_steps
+    batches = max(simulator.memory_estimate(steps, worlds=count) for count in range(1, worlds + 1))
+    return max(batches, max((effort.stages for effort in joint), default=0) * simulator.memory_estimate(steps, worlds=1))
 
 
 def measure_unit(planner: Planner, *, worlds: int, clock: Callable[[], float] = time.perf_counter) -> UnitCost:
@@ -189,7 +205,10 @@ def estimate_run(
     movable = sum(tool.movable for tool in planner.task.scene.tools)
     batch = max(1, min(planner.placer.expected_proposals(movable)[0], planner.simulator.batch_size))
     unit = measure_unit(planner, worlds=min(batch, MEASURED_WORLDS))
-    needed = planner.simulator.memory_estimate(planner.task.rollout_steps, worlds=batch)
+    needed = largest_need(planner, worlds=batch, joint=joint)
+    # What the measurement has left behind is used again, and must not count twice.
+    planner.simulator.release_memory()
+    give_back()
     held = int(psutil.Process().memory_info().rss)
     return RunEstimate(
         stages=stages or planner.task.stage_count,

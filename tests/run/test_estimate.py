@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 
@@ -10,7 +11,7 @@ from cpdeform.core.plugins import load_registry
 from cpdeform.planning.effort import Effort, JointEffort
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.pruner import PrunerHalving, PrunerNone
-from cpdeform.run.estimate import FASTER, SLOWER, RunEstimate, UnitCost, memory_bounds
+from cpdeform.run.estimate import FASTER, SLOWER, RunEstimate, UnitCost, largest_need, memory_bounds
 from cpdeform.run.resolve import resolve
 from cpdeform.run.time_left import TimeLeft, duration, duration_range
 
@@ -54,6 +55,15 @@ def test_a_descent_over_stages_together_costs_a_gradient_of_each_an_iteration() 
     # It is one world, so that the processes that share a stage do not share it.
     assert found.seconds[1] - made(workers=2).seconds[1] == pytest.approx(SLOWER * 2 * (30 * 2.0 + 0.5))
     assert made(workers=2).seconds[0] < found.seconds[0]
+
+
+def test_fewer_worlds_may_take_more_memory_and_stages_together_take_theirs() -> None:
+    # Two worlds keep all substeps, three none, so that a batch that shrinks from three to two takes more than it did.
+    needs = {1: 100, 2: 200, 3: 50}
+    simulator = SimpleNamespace(memory_estimate=lambda steps, worlds: steps * needs[worlds])
+    planner = SimpleNamespace(simulator=simulator, task=SimpleNamespace(rollout_steps=10))
+    assert [largest_need(planner, worlds=worlds) for worlds in (1, 2, 3)] == [1000, 2000, 2000]
+    assert largest_need(planner, worlds=3, joint=[JointEffort(after=4, stages=4, iterations=(1, 1))]) == 4000
 
 
 def test_the_time_left_follows_what_happened() -> None:
