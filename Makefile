@@ -11,6 +11,8 @@ COMPILER := $(shell command -v $${CXX:-c++} 2>/dev/null)
 # The longest first.
 PLUGINS := $(if $(COMPILER),native) baselines example gymnasium
 OUT ?= runs/first
+# Options of pip for torch: where the index at hand has its CUDA build only, those that PyTorch's installation page gives for the CPU.
+TORCH_OPTIONS ?=
 # Processes that the tests are shared out to; each file's tests stay together.
 WORKERS ?= 2
 PYTEST := python -m pytest -n $(WORKERS) --dist loadfile
@@ -66,7 +68,8 @@ GOALS ?=
 goals: $(NATIVE)
 	$(BIN)/python -m cpdeform.tasks.make_goals --check $(GOALS)
 
-# All pictures of README and docs, some minutes; `make pictures PICTURES="writer page"` draws some of them. The page needs Chromium.
+# All pictures of README and docs; `make pictures PICTURES="writer goals-multi-stage-1"` draws some of them. The page needs Chromium,
+# and a run of half an hour, which is kept in runs/pictures.
 PICTURES ?=
 pictures: $(NATIVE)
 	$(BIN)/python scripts/draw_docs.py $(PICTURES)
@@ -98,7 +101,7 @@ endif
 
 $(INSTALLED): pyproject.toml constraints.txt plugins/cpdeform-gymnasium/pyproject.toml plugins/cpdeform-baselines/pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt $(TORCH_OPTIONS) torch==2.13.0
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-deps --editable plugins/cpdeform-example
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable plugins/cpdeform-gymnasium --editable plugins/cpdeform-baselines

@@ -1,52 +1,63 @@
-"""Draw all pictures of README and docs: `make pictures`, or some: `python scripts/draw_docs.py writer page goals`.
+"""Draw all pictures of README and docs: `make pictures`, or some: `python scripts/draw_docs.py writer page goals-multi-stage-1`.
 
-``writer`` is a run of the task writer, ``page`` a screenshot of the page of a run of the task star (a headless Chromium is needed),
-``goals`` are the sheets of all tasks.
+``writer`` is a run of the task writer, ``page`` a screenshot of the page of a run of the task star (a headless Chromium is needed,
+and the run takes half an hour), the others are the sheets of all tasks. Runs are kept in ``runs/pictures``: those that are finished
+are drawn again without being made again. Delete the folder to make them anew.
 """
 
 from __future__ import annotations
 
-import shutil
+import io
+import json
 import subprocess
 import sys
-import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
-DOCS = Path(__file__).parent.parent / "docs"
+from cpdeform.tasks.draw_goals import SHEETS
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS, RUNS = ROOT / "docs", ROOT / "runs" / "pictures"
 PAGE_SIZE = (1280, 900)
-SHOWN = "#stage=2&step=8&colour=priority&goal=1"
-STAGES, ITERATIONS = 3, 20
+SHOWN = "#stage=12&step=10&colour=height&goal=1"
 
 
-def draw_writer(folder: Path) -> None:
+def draw_writer() -> None:
     """The picture at the top of the README."""
-    command("run", "writer", "--out", str(folder / "writer"))
-    shutil.copy(folder / "writer" / "picture.png", DOCS / "writer.png")
+    directory = run("writer")
+    command("draw", str(directory), "--what", "picture")
+    shrink((directory / "picture.png").read_bytes(), DOCS / "writer.png")
 
 
-def draw_page(folder: Path) -> None:
+def draw_page() -> None:
     """The page of a run, as a browser shows it."""
     from cpdeform.report.page.write import write_page
     from cpdeform.testing.browser import Browser
 
-    options = ["--stages", str(STAGES), "--iterations", str(ITERATIONS), "--no-pictures"]
-    command("run", "star", *options, "--out", str(folder / "star"))
-    page = write_page(folder / "star")
+    page = write_page(run("star", "--strategy", "sculpt"))
     with Browser(width=PAGE_SIZE[0], height=PAGE_SIZE[1]) as browser:
         browser.open(page.as_uri() + SHOWN)
         browser.wait_for("document.documentElement?.dataset.ready")
-        shrink(browser.screenshot(DOCS / "pictures" / "page.png"), DOCS / "pictures" / "page.png")
+        shrink(browser.screenshot(), DOCS / "pictures" / "page.png")
 
 
-def draw_goals(folder: Path) -> None:
-    """The sheets of all tasks."""
-    subprocess.run([sys.executable, "-m", "cpdeform.tasks.draw_goals", "--out", str(DOCS / "pictures")], check=True)
+def draw_sheet(name: str) -> None:
+    """A sheet of tasks."""
+    out = ["--out", str(DOCS / "pictures"), "--sheet", name]
+    subprocess.run([sys.executable, "-m", "cpdeform.tasks.draw_goals", *out], check=True)
+
+
+def run(task: str, *options: str) -> Path:
+    """The record of a run, made unless it is there."""
+    directory = RUNS / task
+    record = directory / "run.json"
+    if not record.exists() or json.loads(record.read_text(encoding="utf-8"))["status"] != "finished":
+        command("run", task, *options, "--no-pictures", "--overwrite", "--out", str(directory))
+    return directory
 
 
 def shrink(data: bytes, path: Path) -> None:
     """Write a PNG file of 256 colours: a third of the size, and no difference to see."""
-    import io
-
     from PIL import Image
 
     picture = Image.open(io.BytesIO(data)).convert("RGB")
@@ -58,17 +69,15 @@ def command(*arguments: str) -> None:
     subprocess.run([sys.executable, "-m", "cpdeform", *arguments], check=True)
 
 
-MAKERS = {"writer": draw_writer, "page": draw_page, "goals": draw_goals}
-
-
 def main() -> None:
     """Draw what the command line names, or everything."""
-    names = sys.argv[1:] or list(MAKERS)
-    if unknown := set(names) - set(MAKERS):
-        sys.exit(f"unknown: {', '.join(sorted(unknown))}; there are {', '.join(MAKERS)}")
-    with tempfile.TemporaryDirectory() as folder:
-        for name in names:
-            MAKERS[name](Path(folder))
+    makers: dict[str, Callable[[], None]] = {"writer": draw_writer, "page": draw_page}
+    makers |= {name: lambda name=name: draw_sheet(name) for name in SHEETS}
+    names = sys.argv[1:] or list(makers)
+    if unknown := set(names) - set(makers):
+        sys.exit(f"unknown: {', '.join(sorted(unknown))}; there are {', '.join(makers)}")
+    for name in names:
+        makers[name]()
 
 
 if __name__ == "__main__":

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 PARTS = {"simulator": "--backend", "ot_solver": "--ot"}
 NO_COMPILER = "none: the native simulator and solver cannot be built; Warp and GeomLoss take their place"
 COMPILERS = ("c++", "g++", "clang++", "cl")
+EXTRAS = {"pictures": "report", "meshes": "meshes"}
+"""What needs packages of an extra."""
 
 
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False) -> None:
@@ -37,7 +39,8 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON 
         "failures": [f"{failure.entry_point} [{failure.distribution}]: {failure.reason}" for failure in registry.failures],
         "compiler": next((path for name in (os.environ.get("CXX"), *COMPILERS) if name and (path := shutil.which(name))), None),
         "cuda": _cuda(),
-        "pictures": _pictures(),
+        "pictures": _installed("matplotlib", "skimage", "imageio", "imageio_ffmpeg"),
+        "meshes": _installed("trimesh", "igl", "PIL"),
         "caches": _caches(),
     }
     typer.echo(json.dumps(found) if as_json else _text(found))
@@ -75,23 +78,26 @@ def _cuda() -> list[str]:
     return [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
 
 
-def _pictures() -> dict[str, bool]:
-    """Which packages of the extra "report" are there."""
+def _installed(*names: str) -> dict[str, bool]:
+    """Which of some packages are there."""
     from importlib.util import find_spec
 
-    return {name: find_spec(name) is not None for name in ("matplotlib", "skimage", "imageio", "imageio_ffmpeg")}
+    return {name: find_spec(name) is not None for name in names}
 
 
 def _caches() -> dict[str, str]:
-    """Folders that compiled kernels are kept in."""
+    """Folders that simulators keep compiled kernels in."""
     from cpdeform.backends.kernel_cache import user_cache
 
-    return {"kernels": str(user_cache())}
+    warp = os.environ.get("WARP_CACHE_PATH") or str(user_cache() / "warp")
+    return {"warp": warp, "taichi": str(user_cache() / "taichi")}
 
 
 def _text(found: dict[str, Any]) -> str:
+    from cpdeform.core.wording import counted
+
     versions = ", ".join(f"{name} {version or 'missing'}" for name, version in found["versions"].items())
-    lines = [f"system    {found['platform']}, {found['cores_at_hand']} cores at hand", f"versions  {versions}"]
+    lines = [f"system    {found['platform']}, {counted(found['cores_at_hand'], 'core')} at hand", f"versions  {versions}"]
     for kind, flag in PARTS.items():
         choice = found["auto"][kind]
         lines.append(f"{kind}: auto takes {choice['name'] or 'nothing'} on the CPU ({choice['reason']})")
@@ -101,11 +107,16 @@ def _text(found: dict[str, Any]) -> str:
                 f"  {flag} {part['name']:<10} {'rank ' + rank if part['available'] else 'NOT AVAILABLE: ' + part['reason']}"
             )
     lines += [f"failed to load: {failure}" for failure in found["failures"]]
-    missing = [name for name, there in found["pictures"].items() if not there]
     lines += [
         f"compiler  {found['compiler'] or NO_COMPILER}",
         f"GPU       {', '.join(found['cuda']) or 'none that torch sees'}",
-        f"pictures  {'missing: ' + ', '.join(missing) if missing else 'all that they need is there'}",
+        *(f"{what:<9} {_missing(found[what], extra)}" for what, extra in EXTRAS.items()),
         *(f"cache     {name}: {folder}" for name, folder in found["caches"].items()),
     ]
     return "\n".join(lines)
+
+
+def _missing(packages: dict[str, bool], extra: str) -> str:
+    """What is missing, and the command that installs it."""
+    missing = [name for name, there in packages.items() if not there]
+    return f'missing: {", ".join(missing)}; pip install "cpdeform[{extra}]"' if missing else "all that they need is there"

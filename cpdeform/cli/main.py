@@ -15,6 +15,7 @@ from cpdeform.cli.dataset import dataset
 from cpdeform.cli.doctor import doctor
 from cpdeform.cli.evaluate import evaluate
 from cpdeform.cli.experiment import experiment
+from cpdeform.cli.help_texts import unwrap_help
 from cpdeform.cli.interruption import exit_code, interruptible
 from cpdeform.cli.plugin_commands import PluginGroup
 from cpdeform.cli.plugins import plugins
@@ -89,6 +90,7 @@ app.add_typer(sweep, name="sweep")
 app.add_typer(dataset, name="dataset")
 app.add_typer(bench, name="bench")
 app.add_typer(check, name="check")
+unwrap_help(app)
 
 
 def _show_version(wanted: bool) -> None:

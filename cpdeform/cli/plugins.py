@@ -29,15 +29,16 @@ def plugins(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON
         return
     kind = ""
     tasks = [part for part in parts if part["kind"] == "task" and part["available"]]
+    width = max((len(part["name"]) for part in parts if part not in tasks), default=0)
     for part in parts:
         if part in tasks:
             continue
         if part["kind"] != kind:
             kind = part["kind"]
             typer.echo(kind)
-        typer.echo(f"  {part['name']:<14} {part['summary']}  [{part['distribution']}]")
+        typer.echo(f"  {part['name']:<{width}} {part['summary']}  [{part['distribution']}]")
         if not part["available"]:
-            typer.echo(f"  {'':<14} not available: {part['reason']}")
+            typer.echo(f"  {'':<{width}} not available: {part['reason']}")
     if tasks:
         typer.echo(f"task\n  {len(tasks)} tasks, see `cpdeform tasks`")
     for failure in failures:

@@ -14,6 +14,8 @@ from rich.text import Text
 from torch import Tensor
 
 from cpdeform.core.task import Task
+from cpdeform.core.wording import counted
+from cpdeform.planning.joint import PHASE as JOINT_POLISH
 from cpdeform.planning.optimizer import SEARCH, Iteration
 from cpdeform.planning.result import Observer, Revision, StageResult
 from cpdeform.run.estimate import RunEstimate
@@ -39,8 +41,12 @@ class Progress(Observer):
         """Count batches anew in each stage."""
         if part == "transport":
             self._batch = 0
-            if self._time is not None:
-                self._time.stage_started()
+        if self._time is None:
+            return
+        if part == "transport":
+            self._time.stage_started()
+        elif part == JOINT_POLISH:
+            self._time.joint_started()
 
     def iteration_finished(self, stage: int, iteration: Iteration) -> None:
         """Count the gradients."""
@@ -55,6 +61,8 @@ class Progress(Observer):
 
     def stages_revised(self, revision: Revision) -> None:
         """Leave a line that stays."""
+        if self._time is not None:
+            self._time.joint_finished()
         self._print(_revision_line(revision) + self._time_text())
 
     def _time_text(self) -> str:
@@ -196,9 +204,9 @@ class ProgressLines(Progress):
 
 def estimate_line(estimate: RunEstimate) -> str:
     """What a run will take, in a line."""
-    least, most = estimate.effort.scaled(estimate.stages, estimate.stages).gradients
+    least, most = estimate.total.gradients
     memory = " to ".join(megabytes(count) for count in estimate.memory)
-    work = f"stages {estimate.stages}, {least} to {most} gradient evaluations"
+    work = f"{counted(estimate.stages, 'stage')}, {least} to {most} gradient evaluations"
     return f"estimate: {duration_range(estimate.seconds)}, memory {memory} ({work}; pictures left out)"
 
 
@@ -216,7 +224,7 @@ def _losses(iteration: Iteration) -> str:
 def _stage_line(result: StageResult) -> str:
     return (
         f"stage {result.index + 1}: {result.status.value.replace('_', ' ')}, loss {result.loss_before:.4g} -> {result.loss:.4g}, "
-        f"{len(result.candidates)} candidates, {result.seconds['total']:.1f} s"
+        f"{counted(len(result.candidates), 'candidate')}, {result.seconds['total']:.1f} s"
     )
 
 

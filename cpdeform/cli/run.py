@@ -312,17 +312,20 @@ def _summary(result: DeformResult, resolved: ResolvedRun, directory: Path, *, re
 
 
 def _effort(result: DeformResult) -> str:
-    return f"{result.gradient_evaluations} gradient evaluations, {result.rollouts} rollouts without gradient"
+    from cpdeform.core.wording import counted
+
+    return f"{counted(result.gradient_evaluations, 'gradient evaluation')}, {counted(result.rollouts, 'rollout')} without gradient"
 
 
 def _print_summary(result: DeformResult, directory: Path, picture: Path | None, *, resumed_from: Path | None) -> None:
     from cpdeform.cli.progress import megabytes
+    from cpdeform.core.wording import counted
 
     lines = [
         f"{result.task.name}: {result.status.value.replace('_', ' ')}",
         f"  loss     {result.loss_initial:.4g} -> {result.loss_final:.4g}",
         f"  metric   {result.metric_name.replace('_', ' ')} {result.metric_initial:.4g} -> {result.metric_value:.4g}",
-        f"  effort   {_finished(result)} stages, {_effort(result)}, {result.seconds:.1f} s",
+        f"  effort   {counted(_finished(result), 'stage')}, {_effort(result)}, {result.seconds:.1f} s",
     ]
     if result.memory is not None and result.memory.peak is not None:
         figures = f"{megabytes(result.memory.peak)} at the peak, {megabytes(result.memory.estimate)} estimated"

@@ -19,5 +19,6 @@ def strategies(as_json: Annotated[bool, typer.Option("--json", help="Print one J
     if as_json:
         typer.echo(json.dumps(rows))
         return
+    width = max((len(row["name"]) for row in rows), default=0)
     for row in rows:
-        typer.echo(f"{row['name']:<14} {row['summary']}  [{row['distribution']}]")
+        typer.echo(f"{row['name']:<{width}}  {row['summary']}  [{row['distribution']}]")

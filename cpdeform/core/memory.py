@@ -71,9 +71,9 @@ class MemoryGauge:
         self._forget()
 
     def _forget(self) -> None:
-        # What was dropped lately, which is all that matters here: a full collection takes longer than a small run.
+# What was dropped lately, which is all that matters here: a full collection takes longer than a small run.
         gc.collect(1)
-        _trim()
+        give_back()
         if self._on_cuda:
             torch.cuda.synchronize(self._device)
             torch.cuda.reset_peak_memory_stats(self._device)
@@ -129,7 +129,7 @@ def _highest_resident() -> int:
     return highest if sys.platform == "darwin" else highest * 1024
 
 
-def _trim() -> None:
+def give_back() -> None:
     """Have glibc give freed memory back to the system; other C libraries have nothing of the kind."""
     try:
         ctypes.CDLL(None).malloc_trim(0)

@@ -120,7 +120,30 @@ class PlacerCapabilities:
 
 
 class Placer(abc.ABC):
-    """Proposes candidate placements of the tools."""
+    """Proposes candidate placements of the tools.
+
+    Example:
+        A placer that lifts all tools a little:
+
+        >>> class PlacerLifted(Placer):
+        ...     capabilities = PlacerCapabilities(needs_priorities=False, max_tools=None)
+        ...
+        ...     def ask(self, stage):
+        ...         pose = stage.state.tool_pose[0].clone()
+        ...         pose[:, 1] += 0.05
+        ...         return [Proposal(pose=pose, score=float("nan"), label="lifted")]
+        >>> from cpdeform import load_task
+        >>> from cpdeform.core.state import initial_state
+        >>> task = load_task("writer")
+        >>> state = initial_state(task.scene)
+        >>> goal = torch.as_tensor(task.load_goal())
+        >>> stage = Stage(
+        ...     index=0, scene=task.scene, state=state, goal=goal, transport=None, generator=torch.Generator(), loss=1.0
+        ... )
+        >>> [proposal] = PlacerLifted().ask(stage)
+        >>> f"{float(proposal.pose[0, 1] - state.tool_pose[0, 0, 1]):.3f}"
+        '0.050'
+    """
 
     capabilities: ClassVar[PlacerCapabilities]
 

@@ -81,6 +81,15 @@ class Task(FrozenModel):
 
         Raises:
             InputError: The points are not finite (M, 3) or not in the domain, or a field does not fit.
+
+        Example:
+            A plate, by points at random:
+
+            >>> import numpy as np
+            >>> points = np.random.default_rng(0).uniform((0.3, 0.05, 0.3), (0.7, 0.1, 0.7), (500, 3))
+            >>> task = Task.from_points(points, scene="pinch", path="plate.npz", stage_count=3)
+            >>> task.name, task.stage_count, task.load_goal().shape
+            ('plate', 3, (500, 3))
         """
         found, path = load_task(scene).scene if isinstance(scene, str) else scene, Path(path)
         write_goal_points(path, np.asarray(points, dtype=np.float64), scene=found)
@@ -111,6 +120,15 @@ class Task(FrozenModel):
         Raises:
             InputError: The mesh cannot be used, or does not fit into the domain at the clay's volume.
             MissingExtraError: The extra `meshes` is not installed.
+
+        Example:
+            The goal has as many particles as the clay and stands on the floor where the clay is:
+
+            >>> import trimesh
+            >>> _ = trimesh.creation.cylinder(radius=2.0, height=1.0).export("coin.stl")
+            >>> task = Task.from_mesh("coin.stl", scene="pinch", path="coin.npz")
+            >>> len(task.load_goal()) == task.scene.particle_count
+            True
         """
         from cpdeform.core.meshes.goal import mesh_goal
         from cpdeform.core.meshes.reading import read_mesh

@@ -107,8 +107,8 @@ class PlacerTransport(Placer):
         return TransportProblem(exponent=max(exponents, default=default.exponent), blur=max(blurs, default=default.blur))
 
     def expected_proposals(self, movable: int) -> tuple[int, int]:
-        """See `Placer`; a proposer makes one or two."""
-        return 2 * self.contacts * len(self.proposers or default_proposers(movable)), self.rounds
+        """See `Placer`; a proposer makes one around each contact point."""
+        return self.contacts * len(self.proposers or default_proposers(movable)), self.rounds
 
     def ask(self, stage: Stage) -> list[Proposal]:
         """Propose placements by every proposer, around contact points that were not proposed before in this stage.

@@ -72,6 +72,31 @@ class Planner:
         seed: Seed of first actions and random placements.
         observers: Told of every iteration and stage.
         names: Names of the parts for the record.
+
+    Example:
+        Put together by hand; `cpdeform.deform` does this from names and settings.
+
+        >>> from cpdeform import TrajectoryOptimizer, load_registry, load_task
+        >>> from cpdeform.ot.pot import OTSolverPOT
+        >>> from cpdeform.placement.fixed import PlacerFixed
+        >>> from cpdeform.planning.objectives.transport import ObjectiveTransport
+        >>> from cpdeform.planning.phases.descent import PhaseDescent
+        >>> task, registry = load_task("writer"), load_registry()
+        >>> board = task.scene.bodies[0].model_copy(update={"particle_count": 200})
+        >>> task = task.model_copy(update={"scene": task.scene.model_copy(update={"bodies": (board,)})})
+        >>> fastest = registry.resolve("simulator", "auto", device="cpu")
+        >>> simulator, solver = registry.create("simulator", fastest, scene=task.scene), OTSolverPOT(blur=0.01)
+        >>> planner = Planner(
+        ...     task=task,
+        ...     simulator=simulator,
+        ...     ot_solver=solver,
+        ...     placer=PlacerFixed(),
+        ...     objective=ObjectiveTransport(solver, torch.as_tensor(task.load_goal()).float(), scene=task.scene, points=100),
+        ...     phases=[PhaseDescent(optimizer=TrajectoryOptimizer(iterations=2))],
+        ... )
+        >>> result = planner.run(stages=1)
+        >>> result.loss_final <= result.loss_initial
+        True
     """
 
     task: Task

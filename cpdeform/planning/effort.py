@@ -28,5 +28,26 @@ class Effort:
         )
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class JointEffort:
+    """A descent over several stages together, once they are found.
+
+    Attributes:
+        after: Stages of the run that are over then.
+        stages: Stages that it goes over; an iteration costs a gradient of each.
+        iterations: Fewest and most iterations.
+    """
+
+    after: int
+    stages: int
+    iterations: tuple[int, int]
+
+    @property
+    def effort(self) -> Effort:
+        """What it computes: gradients, and the stages executed anew at its end."""
+        least, most = self.iterations
+        return Effort(gradients=(self.stages * least, self.stages * most), rollouts=(self.stages, self.stages))
+
+
 def _sum(first: tuple[int, int], second: tuple[int, int]) -> tuple[int, int]:
     return first[0] + second[0], first[1] + second[1]

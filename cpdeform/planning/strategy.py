@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 
 from cpdeform.core.objective import Objective
 from cpdeform.core.placer import Placer
+from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start, contact_points_discovery
-from cpdeform.planning.effort import Effort
+from cpdeform.planning.effort import Effort, JointEffort
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.descent import PhaseDescent, PhaseRefinement
 from cpdeform.planning.phases.phase import Phase
@@ -47,9 +48,12 @@ class Strategy(abc.ABC):
 
     Attributes:
         keeps_limits: Whether plans keep to the limits that a task puts on its tools (`Task.limits`).
+        takes_optimizer: Whether phases use `Parts.optimizer`, which the options `optimizer.*` describe; otherwise who sets one of
+            them is told that it has no effect.
     """
 
     keeps_limits: ClassVar[bool] = True
+    takes_optimizer: ClassVar[bool] = True
 
     @abc.abstractmethod
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
@@ -87,6 +91,18 @@ class Strategy(abc.ABC):
             stage: What the phases cost.
         """
         return stage
+
+    def joint_efforts(self, simulator: Simulator, *, stages: int) -> tuple[JointEffort, ...]:
+        """What the loop computes between stages over several of them together, for the estimate; defaults to nothing.
+
+        Args:
+            simulator: Whether its gradients can be chained may decide.
+            stages: Stages of the run.
+
+        Returns:
+            In the order in which they come.
+        """
+        return ()
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult | Revision]:
         """Lead from stage to stage, and maybe come back to some; defaults to the loop of Algorithm 1."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpdeform.core.errors import InputError
+from cpdeform.core.wording import counted
 from cpdeform.planning.result import StageResult
 from cpdeform.report.render import Array, Camera, fit_camera, render
 from cpdeform.report.shapes import tool_surface
@@ -90,8 +91,7 @@ def describe(record: RunRecord) -> str:
     text = f"{record.task.name}:  loss {record.stages[0].loss_before:.4g} → {last.loss:.4g}"
     if record.run.get("metric_value") is not None:
         text += f",  {record.run['metric'].replace('_', ' ')} {record.run['metric_value']:.4g}"
-    stages = record.finished_stages
-    return f"{text}  ({stages} stage{'' if stages == 1 else 's'} executed, status {record.status.replace('_', ' ')})"
+    return f"{text}  ({counted(record.finished_stages, 'stage')} executed, status {record.status.replace('_', ' ')})"
 
 
 def direction_of(camera: str | tuple[float, float]) -> tuple[float, float]:
@@ -142,7 +142,7 @@ def make_view(record: RunRecord, *, camera: str | tuple[float, float] = "default
     return View(fitted, particle_spacing(clouds[1]), float(low[1]), float(high[1]), floor)
 
 
-def tool_surfaces(record: RunRecord, poses: Array, *, rows: int = 220, columns: int = 320) -> list[Array]:
+def tool_surfaces(record: RunRecord, poses: Array, *, rows: int = 64, columns: int = 128) -> list[Array]:
     """Surfaces (R, C, 3) of all tools of a run at the poses (M, 8)."""
     tools = record.task.scene.tools
     return [tool_surface(tool, pose, rows=rows, columns=columns) for tool, pose in zip(tools, poses, strict=True)]

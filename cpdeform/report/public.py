@@ -55,7 +55,7 @@ def render(
         raise InputError("values", came=f"{len(numbers)} numbers", expected=f"one for each of {len(particles)} particles")
     tools = []
     if scene is not None and poses is not None:
-        tools = [tool_surface(tool, pose, rows=220, columns=320) for tool, pose in zip(scene.tools, poses, strict=True)]
+        tools = [tool_surface(tool, pose) for tool, pose in zip(scene.tools, poses, strict=True)]
     if not isinstance(camera, Camera):
         azimuth, elevation = direction_of(camera)
         everything = np.concatenate([particles, *(surface.reshape(-1, 3) for surface in tools)])

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpdeform.report.clay import ClayPoints, clay_points
+from cpdeform.report.shapes import covering
 
 Array = NDArray[np.float64]
 
@@ -117,7 +118,7 @@ def render(
     covered = np.isfinite(depth)
     opacity = covered.astype(np.float64)
     for tool in tools:
-        layer = _draw_points(camera, shape, tool.reshape(-1, 3), 1.3 / scale)
+        layer = _draw_points(camera, shape, covering(tool, distance=1.0 / scale), 1.3 / scale)
         smooth = _fill(layer.depth, layer.mask, 1.0)
         shade = _lambert(camera, smooth, scale)[..., None]
         drawn = np.clip(TOOL_COLOUR * (0.45 + 0.7 * shade) + 0.25 * np.clip(shade, 0.0, 1.0) ** 12, 0.0, 1.0)

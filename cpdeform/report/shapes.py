@@ -37,6 +37,26 @@ def tool_surface(tool: Tool, pose: Array, *, rows: int = 64, columns: int = 128)
     return np.asarray(turned + np.asarray(pose[:3]), dtype=np.float64)
 
 
+def covering(surface: Array, *, distance: float) -> Array:
+    """Points (K, 3) that cover a surface (R, C, 3) of `tool_surface` evenly, with gaps of about `distance` (length units).
+
+    A single row of points is returned as it is.
+    """
+    rows, columns = surface.shape[:2]
+    if rows == 1:
+        return surface.reshape(-1, 3)
+    index = np.arange(rows * columns).reshape(rows, columns)
+    corners = [index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]]
+    triangles = np.concatenate(
+        [np.stack([corners[i] for i in chosen], axis=-1).reshape(-1, 3) for chosen in ((0, 1, 2), (0, 2, 3))]
+    )
+    vertices = surface.reshape(-1, 3)
+    sides = vertices[triangles[:, 1:]] - vertices[triangles[:, :1]]
+    area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    # At the poles of the grid triangles have no area.
+    return points_on(vertices, triangles[area > 0.0], count=max(1, int(area.sum() / distance**2)))
+
+
 def points_on(vertices: Array, triangles: NDArray[np.int64], *, count: int) -> Array:
     """Points (K, 3) in rows on triangles, about `count` of them, one at least on each, as dense on small ones as on large.
 

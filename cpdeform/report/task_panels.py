@@ -60,7 +60,7 @@ def draw_start_and_goal(first: Any, second: Any, task: Task, *, width: int) -> N
     """
     start, goal = sample_particles(task.scene), task.load_goal()
     pose = tool_pose(task.scene).numpy()
-    tools = [tool_surface(tool, pose[index], rows=220, columns=320) for index, tool in enumerate(task.scene.tools)]
+    tools = [tool_surface(tool, pose[index]) for index, tool in enumerate(task.scene.tools)]
     # A fixed pillar may reach far below the floor; that part is not worth the room.
     tools = [np.maximum(surface, (-np.inf, task.scene.ground_height, -np.inf)) for surface in tools]
     view = _make_view(task, start, goal, tools)

@@ -44,7 +44,7 @@ def draw_task(task: Task, path: Path) -> Path:
 
     start, goal = sample_particles(task.scene), task.load_goal()
     pose = tool_pose(task.scene).numpy()
-    tools = [tool_surface(tool, pose[index], rows=220, columns=320) for index, tool in enumerate(task.scene.tools)]
+    tools = [tool_surface(tool, pose[index]) for index, tool in enumerate(task.scene.tools)]
     figure = Figure(figsize=(10.0, 8.0), dpi=100, facecolor="white")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots(2, 2)

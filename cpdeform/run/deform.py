@@ -75,6 +75,16 @@ def deform(
     Raises:
         InputError: A name, an option or the task cannot be used.
         CapabilityError: The parts do not fit together.
+
+    Example:
+        Two iterations with few particles, so that it takes a moment:
+
+        >>> few = {"scene": {"bodies": {"0": {"particle_count": 200}}}, "objective": {"points": 100}}
+        >>> result = deform("writer", stages=1, settings={**few, "optimizer": {"iterations": 2}})
+        >>> result.loss_final <= result.loss_initial
+        True
+        >>> result.save("runs/first").name
+        'first'
     """
     named = {"backend": simulator, "ot": ot_solver, "placer": placer, "strategy": strategy}
     values: dict[str, Any] = {field: part for field, part in named.items() if isinstance(part, str)}

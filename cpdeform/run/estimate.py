@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 
+from cpdeform.core.memory import give_back
 from cpdeform.core.memory_limit import check_memory
 from cpdeform.planning.algorithm import Planner
-from cpdeform.planning.effort import Effort
+from cpdeform.planning.effort import Effort, JointEffort
 from cpdeform.planning.still import still_trajectory
 
 MEASURED_STEPS = 2
@@ -50,26 +51,58 @@ class RunEstimate:
     Attributes:
         stages: Number of stages.
         effort: What a stage computes.
-        seconds: Least and most wall time, pictures left out.
+        joint: What is computed over several stages together.
         memory: Least and most memory of the process at its peak, bytes.
         unit: What was measured.
+        workers: Processes that share the work of a stage.
     """
 
     stages: int
     effort: Effort
-    seconds: tuple[float, float]
+    joint: tuple[JointEffort, ...]
     memory: tuple[int, int]
     unit: UnitCost
+    workers: int = 1
+
+    @property
+    def total(self) -> Effort:
+        """What the run computes."""
+        found = self.effort.scaled(self.stages, self.stages)
+        for joint in self.joint:
+            found += joint.effort
+        return found
+
+    @property
+    def seconds(self) -> tuple[float, float]:
+        """Least and most wall time, pictures left out."""
+        bounds = [self._stage_bounds] * self.stages + [self._bounds(joint.effort) for joint in self.joint]
+        return sum(least for least, _ in bounds), sum(most for _, most in bounds)
 
     @property
     def stage_seconds(self) -> float:
         """Wall time of a stage, in the middle (of the two bounds, the geometric one)."""
-        return math.sqrt(self.seconds[0] * self.seconds[1]) / self.stages
+        return math.sqrt(math.prod(self._stage_bounds))
 
     @property
     def stage_gradients(self) -> float:
         """Gradients of a stage, in the middle; at least one."""
         return max(1.0, math.sqrt(max(1, self.effort.gradients[0]) * self.effort.gradients[1]))
+
+    def joint_seconds(self, joint: JointEffort) -> float:
+        """Wall time of a descent over stages together, in the middle."""
+        return math.sqrt(math.prod(self._bounds(joint.effort)))
+
+    @property
+    def _stage_bounds(self) -> tuple[float, float]:
+        least, most = self._bounds(self.effort, workers=self.workers)
+        return least + FASTER * self.unit.transport, most + SLOWER * self.unit.transport
+
+    def _bounds(self, effort: Effort, *, workers: int = 1) -> tuple[float, float]:
+        """Least and most wall time of some work."""
+        least, most = (
+            (self.unit.gradient * effort.gradients[end] + self.unit.rollout * effort.rollouts[end]) / workers for end in (0, 1)
+        )
+        return FASTER * least, SLOWER * most
 
 
 def stage_effort(planner: Planner) -> Effort:
@@ -84,27 +117,29 @@ def stage_effort(planner: Planner) -> Effort:
     return by_scope["round"].scaled(1, rounds) + by_scope["search"] + executed + by_scope["plan"]
 
 
-def estimate(*, stages: int, effort: Effort, unit: UnitCost, held: int, needed: int, workers: int = 1) -> RunEstimate:
-    """Put counts and measurements together.
+def memory_bounds(held: int, needed: int) -> tuple[int, int]:
+    """Least and most bytes of the process at its peak.
 
     Args:
-        stages: Number of stages.
-        effort: What a stage computes.
-        unit: What that costs.
-        held: Bytes that the process holds now.
-        needed: Bytes that rollouts and gradients of the largest batch hold.
-        workers: Processes that share the work.
+        held: Bytes that the process holds before.
+        needed: Bytes that rollouts and gradients hold, see `largest_need`.
     """
-    least, most = (
-        (unit.gradient * effort.gradients[end] + unit.rollout * effort.rollouts[end]) / workers + unit.transport for end in (0, 1)
-    )
-    return RunEstimate(
-        stages=stages,
-        effort=effort,
-        seconds=(stages * FASTER * least, stages * SLOWER * most),
-        memory=(held + int(0.8 * needed), held + int(1.2 * needed) + LIBRARIES),
-        unit=unit,
-    )
+    return held + int(0.8 * needed), held + int(1.2 * needed) + LIBRARIES
+
+
+def largest_need(planner: Planner, *, worlds: int, joint: Sequence[JointEffort] = ()) -> int:
+    """The most bytes that rollouts and gradients hold.
+
+    Batches shrink as candidates are dropped, and fewer worlds may take more: where their whole history fits, it is kept.
+
+    Args:
+        planner: The run's parts.
+        worlds: Worlds of the largest batch.
+        joint: What is computed over several stages together, one world each.
+    """
+    simulator, steps = planner.simulator, planner.task.rollout_steps
+    batches = max(simulator.memory_estimate(steps, worlds=count) for count in range(1, worlds + 1))
+    return max(batches, max((effort.stages for effort in joint), default=0) * simulator.memory_estimate(steps, worlds=1))
 
 
 def measure_unit(planner: Planner, *, worlds: int, clock: Callable[[], float] = time.perf_counter) -> UnitCost:
@@ -144,7 +179,14 @@ def measure_unit(planner: Planner, *, worlds: int, clock: Callable[[], float] = 
     )
 
 
-def estimate_run(planner: Planner, *, stages: int | None = None, workers: int = 1, effort: Effort | None = None) -> RunEstimate:
+def estimate_run(
+    planner: Planner,
+    *,
+    stages: int | None = None,
+    workers: int = 1,
+    effort: Effort | None = None,
+    joint: Sequence[JointEffort] = (),
+) -> RunEstimate:
     """Estimate a run that is about to start.
 
     Args:
@@ -152,6 +194,7 @@ def estimate_run(planner: Planner, *, stages: int | None = None, workers: int = 
         stages: Number of stages; defaults to the task's.
         workers: Processes that the work is spread over.
         effort: What a stage computes; defaults to what its phases say.
+        joint: What is computed over several stages together.
 
     Raises:
         InputError: There is not enough memory.
@@ -162,6 +205,16 @@ def estimate_run(planner: Planner, *, stages: int | None = None, workers: int = 
     movable = sum(tool.movable for tool in planner.task.scene.tools)
     batch = max(1, min(planner.placer.expected_proposals(movable)[0], planner.simulator.batch_size))
     unit = measure_unit(planner, worlds=min(batch, MEASURED_WORLDS))
-    needed = planner.simulator.memory_estimate(planner.task.rollout_steps, worlds=batch)
+    needed = largest_need(planner, worlds=batch, joint=joint)
+    # What the measurement has left behind is used again, and must not count twice.
+    planner.simulator.release_memory()
+    give_back()
     held = int(psutil.Process().memory_info().rss)
-    return estimate(stages=stages or planner.task.stage_count, effort=effort, unit=unit, held=held, needed=needed, workers=workers)
+    return RunEstimate(
+        stages=stages or planner.task.stage_count,
+        effort=effort,
+        joint=tuple(joint),
+        memory=memory_bounds(held, needed),
+        unit=unit,
+        workers=workers,
+    )

@@ -45,6 +45,7 @@ from cpdeform.run.parts import (
 from cpdeform.run.record_reader import RunRecord
 from cpdeform.run.result import RunResult
 from cpdeform.run.resume import check_same_task, resumed_task, resumed_values
+from cpdeform.run.unused_options import warn_about_optimizer
 
 MAX_WORLDS = 16
 """Worlds that a simulator given by name holds at once; more candidates are computed in several batches."""
@@ -142,6 +143,7 @@ class ResolvedRun:
         configuration, registry, objects, task = self.configuration, self.registry, self.objects, self.task
         prepare_for_forks()
         warn_about_tools(task.scene)
+        warn_about_optimizer(self.strategy, self.names["strategy"], origins=self.origins)
         placer = objects.placer
         if placer is None:
             named = registry.create("placer", configuration.placer, **configuration.placer_options)
@@ -207,7 +209,9 @@ class ResolvedRun:
         """
         configuration = self.configuration
         effort = self.strategy.effort(stage_effort(planner))
-        return estimate_run(planner, stages=configuration.stages, workers=configuration.workers, effort=effort)
+        stages = configuration.stages or self.task.stage_count
+        joint = self.strategy.joint_efforts(planner.simulator, stages=stages)
+        return estimate_run(planner, stages=stages, workers=configuration.workers, effort=effort, joint=joint)
 
     def run(
         self, observers: Sequence[Observer] = (), *, on_estimate: Callable[[RunEstimate | None], None] | None = None

@@ -60,7 +60,7 @@ def test_summary_and_default_directory(directory):
     assert result.exit_code == 0, result.output
     made = list((directory / "runs").iterdir())
     assert [path.name.startswith("shift-2") for path in made] == [True]
-    for text in ("shift: finished", "loss", "wasserstein", "1 stages", f"runs/{made[0].name}"):
+    for text in ("shift: finished", "loss", "wasserstein", "1 stage,", f"runs/{made[0].name}"):
         assert text in result.stdout
     assert "stage 1: finished" in result.stderr
 

@@ -59,6 +59,14 @@ def test_help_tells_the_defaults(command):
     assert "  ." not in result.stdout
 
 
+def test_paragraphs_of_help_are_broken_where_the_terminal_ends():
+    result = CliRunner().invoke(app, ["task", "new", "--help"], env={"COLUMNS": "100"})
+    (line,) = (line for line in result.stdout.splitlines() if line.strip().startswith("Meshes are repaired"))
+    assert len(line.rstrip()) > 85
+    examples = [line.strip() for line in CliRunner().invoke(app, ["verify", "--help"]).stdout.splitlines()]
+    assert examples[examples.index("Examples:") + 1] == "cpdeform verify runs/star"
+
+
 @pytest.mark.parametrize("arguments", [["writr"], ["writer", "--backend", "wrap"], ["writer", "--set", "algorithm=paper"]])
 def test_typos_are_answered_before_torch_is_imported(arguments):
     script = (

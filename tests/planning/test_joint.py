@@ -168,6 +168,25 @@ def test_the_strategy_polishes_two_stages_at_a_time(task):
     assert not any(PHASE in stage.seconds for stage in alone.stages)
 
 
+def test_the_estimate_counts_the_gradients_that_joint_descents_compute(task):
+    """Neither stages nor descents stop early here, so that what is told at most is what is computed."""
+    changes = {"together": 2, "joint_every": 1, "joint_iterations": 5, "interim_iterations": 2}
+    efforts = StrategySculpt(**changes).joint_efforts(SimulatorChained(task.scene), stages=3)
+    found = [(effort.after, effort.stages, effort.iterations) for effort in efforts]
+    assert found == [
+        (1, 1, (2, 2)),
+        (2, 2, (5, 5)),
+        (3, 1, (5, 5)),
+    ]
+    result = sculpted(task, changes=changes)
+    joint = sum(iteration.phase == PHASE for stage in result.stages for iteration in stage.history)
+    assert joint == sum(effort.iterations[1] for effort in efforts)
+    alone = sculpted(task, simulator=SimulatorToy, changes=changes)
+    counted = sum(effort.effort.gradients[1] for effort in efforts)
+    assert result.gradient_evaluations == alone.gradient_evaluations + counted
+    assert StrategySculpt(**changes).joint_efforts(SimulatorToy(task.scene), stages=3) == ()
+
+
 def test_stages_are_polished_on_the_way_and_once_more_at_the_end(task):
     """All three together at the end; the first two on their way, and the third one goes on from where these then end."""
     result = sculpted(task, changes={"together": 3, "joint_every": 2, "interim_iterations": 2})

@@ -86,6 +86,13 @@ def test_a_run_by_touches(task):
     assert again.loss_final == result.loss_final
 
 
+def test_iterations_that_have_no_effect_are_told(task):
+    parts = {"simulator": SimulatorToy(task.scene, batch_size=4), "ot_solver": OTSolverToy()}
+    small = StrategySculpt(touches=2, variations=2, iterations=(1, 1))
+    with pytest.warns(UserWarning, match="--iterations: no effect, since the strategy StrategySculpt"):
+        deform(task, strategy=small, stages=1, settings={"optimizer": {"iterations": 3}, "objective": {"points": None}}, **parts)
+
+
 def test_settings_and_options():
     strategy = StrategySculpt(touches=10)
     found = strategy.settings(load_task("star"), placer=None)

@@ -8,6 +8,7 @@ import imageio.v2
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import KDTree
 
 import cpdeform
 from cpdeform.core.errors import InputError
@@ -26,7 +27,7 @@ from cpdeform.report.animation import _between, _moments, draw_animation
 from cpdeform.report.draw import draw_chosen
 from cpdeform.report.pictures import draw_picture
 from cpdeform.report.render import fit_camera, render
-from cpdeform.report.shapes import tool_surface
+from cpdeform.report.shapes import covering, tool_surface
 from cpdeform.run.deform import deform
 from cpdeform.run.record import load_record
 
@@ -54,6 +55,17 @@ def test_tool_surfaces_are_the_tools(tool):
     a, b, c, d = surface[:-1, :-1], surface[1:, :-1], surface[1:, 1:], surface[:-1, 1:]
     parts = [np.einsum("...i,...i->...", x - pose[:3], np.cross(y - pose[:3], z - pose[:3])) for x, y, z in ((a, b, c), (a, c, d))]
     assert abs(sum(part.sum() for part in parts)) / 6.0 == pytest.approx(volume(tool), rel=0.02)
+
+
+@pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.kind)
+def test_tools_are_covered_without_gaps(tool):
+    """A grid of points is dense on some faces and has gaps on others; what covers it has none, and lies on the tool."""
+    pose = np.array([0.3, 0.4, 0.5, 1.0, 0.0, 0.0, 0.0, 0.15])
+    points = covering(tool_surface(tool, pose), distance=0.004)
+    distance = signed_distance(tool, torch.as_tensor(pose), torch.as_tensor(points))
+    assert float(distance.abs().max()) < 1e-3
+    fine = tool_surface(tool, pose, rows=150, columns=150).reshape(-1, 3)
+    assert float(KDTree(points).query(fine)[0].max()) < 0.004
 
 
 def volume(tool):

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 
 from cpdeform.core.plugins import load_registry
-from cpdeform.planning.effort import Effort
+from cpdeform.planning.effort import Effort, JointEffort
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.pruner import PrunerHalving, PrunerNone
-from cpdeform.run.estimate import FASTER, SLOWER, RunEstimate, UnitCost, estimate
+from cpdeform.run.estimate import FASTER, SLOWER, RunEstimate, UnitCost, largest_need, memory_bounds
 from cpdeform.run.resolve import resolve
 from cpdeform.run.time_left import TimeLeft, duration, duration_range
 
@@ -24,9 +25,9 @@ class Clock:
         return self.now
 
 
-def made(*, stages: int = 2, gradients: tuple[int, int] = (10, 40), rollouts: tuple[int, int] = (1, 1), **options) -> RunEstimate:
-    effort = Effort(gradients=gradients, rollouts=rollouts)
-    return estimate(stages=stages, effort=effort, unit=UNIT, held=1000, needed=100, **options)
+def made(*, stages: int = 2, gradients: tuple[int, int] = (10, 40), joint: tuple[JointEffort, ...] = (), **options) -> RunEstimate:
+    effort = Effort(gradients=gradients, rollouts=(1, 1))
+    return RunEstimate(stages=stages, effort=effort, joint=joint, memory=memory_bounds(1000, 100), unit=UNIT, **options)
 
 
 @pytest.mark.parametrize("pruner", [PrunerNone(), PrunerHalving()])
@@ -45,6 +46,24 @@ def test_seconds_and_bytes_are_sums_of_what_was_measured() -> None:
     assert found.memory[1] > 1120
     shared = made(workers=2)
     assert shared.seconds[0] == pytest.approx(2 * FASTER * (10.25 + 1.0))
+
+
+def test_a_descent_over_stages_together_costs_a_gradient_of_each_an_iteration() -> None:
+    joint = JointEffort(after=2, stages=2, iterations=(5, 30))
+    found = made(joint=(joint,), workers=2)
+    assert found.total.gradients == (2 * 10 + 2 * 5, 2 * 40 + 2 * 30)
+    # It is one world, so that the processes that share a stage do not share it.
+    assert found.seconds[1] - made(workers=2).seconds[1] == pytest.approx(SLOWER * 2 * (30 * 2.0 + 0.5))
+    assert made(workers=2).seconds[0] < found.seconds[0]
+
+
+def test_fewer_worlds_may_take_more_memory_and_stages_together_take_theirs() -> None:
+    # Two worlds keep all substeps, three none, so that a batch that shrinks from three to two takes more than it did.
+    needs = {1: 100, 2: 200, 3: 50}
+    simulator = SimpleNamespace(memory_estimate=lambda steps, worlds: steps * needs[worlds])
+    planner = SimpleNamespace(simulator=simulator, task=SimpleNamespace(rollout_steps=10))
+    assert [largest_need(planner, worlds=worlds) for worlds in (1, 2, 3)] == [1000, 2000, 2000]
+    assert largest_need(planner, worlds=3, joint=[JointEffort(after=4, stages=4, iterations=(1, 1))]) == 4000
 
 
 def test_the_time_left_follows_what_happened() -> None:
@@ -73,6 +92,51 @@ def test_the_time_left_follows_what_happened() -> None:
     clock.now = 110.0
     left.stage_finished()
     assert left.seconds() == 0.0
+
+
+def test_the_time_left_knows_of_descents_to_come() -> None:
+    clock = Clock()
+    first, last = JointEffort(after=1, stages=1, iterations=(10, 10)), JointEffort(after=2, stages=2, iterations=(40, 40))
+    expected = made(joint=(first, last))
+    left = TimeLeft(expected, stages=2, clock=clock)
+    left.stage_started()
+    both = expected.joint_seconds(first) + expected.joint_seconds(last)
+    assert left.seconds() == pytest.approx(2 * expected.stage_seconds + both)
+    clock.now += 7.0
+    left.stage_finished()
+    assert left.seconds() == pytest.approx(7.0 + both)
+    # The first takes twice what was expected, and so will the last.
+    left.joint_started()
+    left.evaluated(5)
+    clock.now += expected.joint_seconds(first)
+    halfway = left.seconds()
+    left.evaluated(5)
+    clock.now += expected.joint_seconds(first)
+    left.joint_finished()
+    left.stage_started()
+    ahead = 2.0 * expected.joint_seconds(last)
+    assert left.seconds() == pytest.approx(7.0 + ahead)
+    assert halfway is not None
+    assert halfway == pytest.approx(7.0 + expected.joint_seconds(last) + 0.5 * expected.joint_seconds(first))
+    clock.now += 7.0
+    left.stage_finished()
+    assert left.seconds() == pytest.approx(ahead)
+    left.joint_started()
+    clock.now += 10.0
+    assert left.seconds() == pytest.approx(ahead - 10.0)
+    left.joint_finished()
+    assert left.seconds() == 0.0
+
+
+def test_a_descent_that_does_not_come_is_forgotten() -> None:
+    expected = made(joint=(JointEffort(after=1, stages=1, iterations=(10, 10)),))
+    clock = Clock()
+    left = TimeLeft(expected, stages=2, clock=clock)
+    left.stage_started()
+    clock.now += 3.0
+    left.stage_finished()
+    left.stage_started()
+    assert left.seconds() == pytest.approx(3.0)
 
 
 def test_stages_whose_results_come_together_share_their_time() -> None:
@@ -107,7 +171,7 @@ def test_a_run_does_not_compute_more_than_was_estimated(toy_entry_points, toy_ta
     told = []
     result = resolved.run(on_estimate=told.append)
     assert told[0].stages == resolved.task.stage_count
-    assert result.gradient_evaluations <= told[0].stages * told[0].effort.gradients[1]
+    assert result.gradient_evaluations <= told[0].total.gradients[1]
     assert told[0].seconds[0] <= told[0].seconds[1]
     # Measuring changes nothing in the run.
     again = resolve(given, registry=toy_registry).run()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -14,7 +14,7 @@ from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
 from cpdeform.planning.coarse import CoarseModel
-from cpdeform.planning.effort import Effort
+from cpdeform.planning.effort import JointEffort
 from cpdeform.planning.interrupted import StageInterrupted, StagesInterrupted
 from cpdeform.planning.joint import PHASE as JOINT_POLISH
 from cpdeform.planning.joint import polish_jointly
@@ -61,6 +61,8 @@ class StrategySculpt(Strategy):
     Raises:
         InputError: An option is out of range.
     """
+
+    takes_optimizer: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -114,10 +116,17 @@ class StrategySculpt(Strategy):
             ),
         )
 
-    def effort(self, stage: Effort) -> Effort:
-        """See `Strategy`; a stage has a part in the joint descents, too: on the way in those after it, half of all on average."""
-        on_the_way = (self.together - 1) // self.joint_every * self._interim.iterations // 2
-        return stage + Effort(gradients=(0, on_the_way + self._joint.iterations))
+    def joint_efforts(self, simulator: Simulator, *, stages: int) -> tuple[JointEffort, ...]:
+        """See `Strategy`; each goes over all stages found since the last chapter."""
+        if not takes_final_gradient(simulator):
+            return ()
+        efforts = []
+        for chapter in _parts(range(stages), self.together):
+            for part in _parts(chapter, self.joint_every):
+                optimizer = self._joint if part[-1] == chapter[-1] else self._interim
+                count = part[-1] + 1 - chapter[0]
+                efforts.append(JointEffort(after=part[-1] + 1, stages=count, iterations=optimizer.effort(1).gradients))
+        return tuple(efforts)
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult | Revision]:
         """One touch a stage, from rest to rest, some polished together; a few stages without a gain do not end the run."""
@@ -126,9 +135,8 @@ class StrategySculpt(Strategy):
             planner = screened_coarsely(planner)
         finished: list[StageResult] = []
         end = start.first_stage + start.stages
-        for first in range(start.first_stage, end, self.together):
+        for stages in _parts(range(start.first_stage, end), self.together):
             held: list[StageResult] = []
-            stages = range(first, min(first + self.together, end))
             for part in _parts(stages, self.joint_every):
                 for result in self._touches(planner, start, part, [*finished, *held]):
                     held.append(result)

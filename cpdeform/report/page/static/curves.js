@@ -42,7 +42,7 @@ function chart(host, data, series, label) {
   const { uPlot } = libraries;
   const axis = { stroke: "#7a7167", grid: { stroke: "#eeeae2", width: 1 }, font: "11px system-ui" };
   const options = {
-    width: Math.max(host.parentElement.clientWidth - 26, 240), height: CHART_HEIGHT, legend: { show: series.length <= 8 },
+    width: Math.max(host.parentElement.clientWidth - 26, 240), height: CHART_HEIGHT, legend: { show: series.length > 1 && series.length <= 8 },
     scales: { x: { time: false } }, series: [{ label }, ...series],
     axes: [{ ...axis, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000], size: 28 }, { ...axis, size: 62, values: (_, ticks) => ticks.map((tick) => short(tick, 3)) }],
   };
