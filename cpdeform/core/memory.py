@@ -71,7 +71,7 @@ class MemoryGauge:
         self._forget()
 
     def _forget(self) -> None:
-# What was dropped lately, which is all that matters here: a full collection takes longer than a small run.
+        # What was dropped lately, which is all that matters here: a full collection takes longer than a small run.
         gc.collect(1)
         give_back()
         if self._on_cuda:
