@@ -1,6 +1,6 @@
 """Draw all pictures of README and docs: `make pictures`, or some: `python scripts/draw_docs.py writer page goals-multi-stage-1`.
 
-``writer`` is a run of the task writer, ``page`` a screenshot of the page of a run of the task star (a headless Chromium is needed,
+``writer`` is a run of the task writer, ``sculpted`` shows runs of some tasks with the strategy ``sculpt``, ``page`` a screenshot of the page of a run of the task star (a headless Chromium is needed,
 and the run takes half an hour), the others are the sheets of all tasks. Runs are kept in ``runs/pictures``: those that are finished
 are drawn again without being made again. Delete the folder to make them anew.
 """
@@ -19,6 +19,8 @@ from cpdeform.tasks.draw_goals import SHEETS
 ROOT = Path(__file__).resolve().parents[1]
 DOCS, RUNS = ROOT / "docs", ROOT / "runs" / "pictures"
 PAGE_SIZE = (1280, 900)
+SCULPTED = {"star": "top", "airplane": "top", "bottle": "front"}
+"""Tasks of the picture of sculpted shapes, and where they are looked at from."""
 SHOWN = "#stage=12&step=10&colour=height&goal=1"
 
 
@@ -27,6 +29,41 @@ def draw_writer() -> None:
     directory = run("writer")
     command("draw", str(directory), "--what", "picture")
     shrink((directory / "picture.png").read_bytes(), DOCS / "writer.png")
+
+
+def draw_sculpted() -> None:
+    """A row a run: the start, the first touch with its tools, half of the touches, the result, and the goal."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from torch import cat
+
+    from cpdeform.report.pictures import draw_panel, make_view
+    from cpdeform.run.record_reader import load_record
+
+    figure = Figure(figsize=(12.5, 2.6 * len(SCULPTED)), dpi=80, layout="constrained", facecolor="white")
+    for (task, camera), axes in zip(SCULPTED.items(), figure.subplots(len(SCULPTED), 5, squeeze=False), strict=True):
+        record = load_record(run(task, "--strategy", "sculpt"))
+        view = make_view(record, camera=camera)
+        stages = [stage for stage in record.stages if stage.status.executed]
+        first, half, last = stages[0], stages[len(stages) // 2 - 1], stages[-1]
+        clouds = [
+            first.state_before.position[0],
+            first.state.position[0],
+            half.state.position[0],
+            last.state.position[0],
+            record.goal,
+        ]
+        titles = (f"{task}: start", "first touch", f"after {len(stages) // 2} touches", f"after {len(stages)}", "goal")
+        for axis, title, cloud in zip(axes, titles, clouds, strict=True):
+            draw_panel(axis, view, record, title, cloud.double(), first.tool_poses[-1] if title == "first touch" else None)
+            shown = view.camera.project(cat([clouds[0], clouds[-1]]).double().numpy())
+            low, high = shown.min(axis=0), shown.max(axis=0)
+            margin = 0.25 * max(high[:2] - low[:2])
+            axis.set_xlim(low[0] - margin, high[0] + margin)
+            axis.set_ylim(low[1] - margin, high[1] + margin)
+    picture = io.BytesIO()
+    FigureCanvasAgg(figure).print_figure(picture, format="png")
+    shrink(picture.getvalue(), DOCS / "pictures" / "sculpted.png")
 
 
 def draw_page() -> None:
@@ -71,7 +108,7 @@ def command(*arguments: str) -> None:
 
 def main() -> None:
     """Draw what the command line names, or everything."""
-    makers: dict[str, Callable[[], None]] = {"writer": draw_writer, "page": draw_page}
+    makers: dict[str, Callable[[], None]] = {"writer": draw_writer, "sculpted": draw_sculpted, "page": draw_page}
     makers |= {name: lambda name=name: draw_sheet(name) for name in SHEETS}
     names = sys.argv[1:] or list(makers)
     if unknown := set(names) - set(makers):
