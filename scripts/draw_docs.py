@@ -1,8 +1,9 @@
 """Draw all pictures of README and docs: `make pictures`, or some: `python scripts/draw_docs.py writer page goals-multi-stage-1`.
 
-``writer`` is a run of the task writer, ``sculpted`` shows runs of some tasks with the strategy ``sculpt``, ``page`` a screenshot of the page of a run of the task star (a headless Chromium is needed,
-and the run takes half an hour), the others are the sheets of all tasks. Runs are kept in ``runs/pictures``: those that are finished
-are drawn again without being made again. Delete the folder to make them anew.
+``writer`` is a run of the task writer, ``sculpted`` shows runs of some tasks with the strategy ``sculpt``, ``page`` is a
+screenshot of the page of one of them (a headless Chromium is needed); each of these runs takes about half an hour. The others are
+the sheets of all tasks. Runs are kept in ``runs/pictures``: those that are finished are drawn again without being made again.
+Delete the folder to make them anew.
 """
 
 from __future__ import annotations
