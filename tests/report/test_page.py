@@ -52,6 +52,20 @@ def test_the_file_holds_the_run(page):
     assert len(content["curves"]) == sum(line["kind"] == "iteration" for line in record.metrics)
 
 
+def test_the_tools_way_to_a_stage_leads_over_the_clay(page):
+    record = load_record(page.parent)
+    first, second = content_of(page.read_text())["stages"]
+    assert "way" not in first
+    way = np.array(second["way"])
+    np.testing.assert_allclose(way[0], record.stages[0].tool_poses[-1], atol=1e-5)
+    np.testing.assert_allclose(way[-1], record.stages[1].tool_poses[0], atol=1e-5)
+    highest = float(record.stages[1].state_before.position[..., 1].max())
+    assert way[:, 0, 1].max() > highest
+    # Nowhere does a tool go aside but above the clay.
+    level = np.abs(np.diff(way[:, 0], axis=0)[:, [0, 2]]).max(axis=1) > 1e-6
+    assert (way[:-1, 0, 1][level] > highest).all()
+
+
 def test_candidates_that_lost_are_rolled_out(record, toy_entry_points):
     from cpdeform_toy.parts import PlacerFixedToy
 
@@ -155,6 +169,20 @@ def test_it_plays_without_asking_the_network(browser, page):
     browser.ask("cpdeform.player.play(false)")
     assert {address.partition("#")[0] for address in browser.requests()} == {page.as_uri()}
     assert browser.ask("fetch('http://127.0.0.1:9/').then(() => 'asked', () => 'refused')") == "refused"
+
+
+def test_the_tools_are_seen_on_their_way(browser, page):
+    opened(browser, page)
+    way = content_of(page.read_text())["stages"][1]["way"]
+    browser.ask("cpdeform.player.goTo(0, 5)")
+    browser.ask("cpdeform.player.play(true)")
+    browser.wait_for("cpdeform.player.stage === 1 && document.getElementById('caption').textContent.includes('on their way')")
+    browser.ask("cpdeform.player.play(false)")
+    found = "(cpdeform.player.showWay(cpdeform.player.current.way, SHARE), cpdeform.view.tools[0].mesh.position.toArray())"
+    for share, pose in ((0, way[0][0]), (1, way[-1][0])):
+        assert browser.ask(found.replace("SHARE", str(share))) == pytest.approx(pose[:3], abs=1e-6)
+    browser.ask("cpdeform.player.goTo(1, 0)")
+    assert "on their way" not in browser.ask("document.getElementById('caption').textContent")
 
 
 def test_colours_goal_and_particles_change_the_picture(browser, page):

@@ -8,12 +8,13 @@ import threading
 import urllib.error
 import urllib.request
 
+import h5py
 import pytest
 
 from cpdeform.core.errors import InputError
 from cpdeform.report.page.encoding import decode_frames
 from cpdeform.report.page.server import PageServer
-from cpdeform.run.record_files import stage_file
+from cpdeform.run.record_files import METRICS_FILE, stage_file
 
 
 @pytest.fixture
@@ -81,6 +82,27 @@ def test_the_browser_follows(browser, whole_record, serve, tmp_path):
     assert browser.ask("cpdeform.player.content.stages.length") == 1
     shutil.copy(whole_record / stage_file(1), tmp_path / "half")
     browser.wait_for("cpdeform.player.content.stages.length === 2 && cpdeform.player.stage === 1")
+    assert browser.complaints() == []
+
+
+def test_a_stage_that_is_revised_is_shown_anew(browser, whole_record, serve, tmp_path):
+    directory = shutil.copytree(whole_record, tmp_path / "revised")
+    address = serve(directory)
+    browser.open(address)
+    browser.wait_for("document.documentElement?.dataset.ready || document.documentElement?.dataset.error")
+    before = browser.ask("cpdeform.player.shown")
+    first, second = (stage["positions"] for stage in json.loads(get(address + "content.json")[1])["stages"])
+    with h5py.File(directory / stage_file(0), "a") as file:
+        del file["positions"]
+        with h5py.File(directory / stage_file(1)) as other:
+            other.copy("positions", file)
+    with (directory / METRICS_FILE).open("a") as file:
+        file.write(json.dumps({"kind": "revision", "stage": 0, "stages": 1, "loss": 0.5}) + "\n")
+    revised, kept = (stage["positions"] for stage in json.loads(get(address + "content.json")[1])["stages"])
+    assert (revised != first, kept) == (True, second)
+    assert get(address + "arrays/" + revised)[1] == get(address + "arrays/" + second)[1]
+    assert get(address + "arrays/" + first)[0] == 404
+    browser.wait_for(f"cpdeform.player.shown !== {json.dumps(before)}")
     assert browser.complaints() == []
 
 

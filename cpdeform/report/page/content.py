@@ -13,12 +13,16 @@ from cpdeform.report.page.encoding import encode_frames, encode_levels, spatial_
 from cpdeform.report.page.shapes import Array, describe_goal, describe_tools
 from cpdeform.report.pictures import CLAY
 from cpdeform.report.surface import particle_spacing
+from cpdeform.run.clearance import way
 from cpdeform.run.command import command_of
 from cpdeform.run.record import RunRecord
 from cpdeform.run.record_files import to_json
 from cpdeform.run.resume import recorded_configuration
 
 POSE_DIGITS = 5
+WAY_EVERY = 3
+"""Of the poses on a way between stages, the page gets every so many."""
+
 PRIORITY_COLOURS = "viridis"
 ERROR_COLOURS = ("#e8dcc8", "#f0b27a", "#d1495b", "#6a0f2b")
 COLOUR_STOPS = 17
@@ -69,7 +73,13 @@ def make_page(
     order = spatial_order(positions)
     arrays: dict[str, Callable[[], bytes]] = {}
     goal = record.goal.double().numpy()
-    stages = [_stage(stage, order, arrays, (replays or {}).get(stage.index, ())) for stage in record.stages]
+    names = _stage_names(record)
+    stages = [
+        _stage(stage, name, order, arrays, (replays or {}).get(stage.index, ()))
+        for stage, name in zip(record.stages, names, strict=True)
+    ]
+    for described, stage, before in zip(stages[1:], record.stages[1:], record.stages, strict=False):
+        described["way"] = _way(record, before, stage)
     content = {
         "name": record.task.name,
         "summary": record.task.summary,
@@ -104,13 +114,24 @@ def _start(record: RunRecord) -> Array:
     return np.asarray(sample_particles(record.task.scene))
 
 
+def _stage_names(record: RunRecord) -> list[str]:
+    """What arrays of each stage begin with: another name once the stage has been revised, since arrays are kept by their names."""
+    names = []
+    for stage in record.stages:
+        revisions = sum(
+            line.get("kind") == "revision" and line["stage"] - line["stages"] < stage.index <= line["stage"]
+            for line in record.metrics
+        )
+        names.append(f"stage-{stage.index}" + (f"-revision-{revisions}" if revisions else ""))
+    return names
+
+
 def _stage(
-    stage: StageResult, order: Any, arrays: dict[str, Callable[[], bytes]], replays: Sequence[ReplayedCandidate]
+    stage: StageResult, name: str, order: Any, arrays: dict[str, Callable[[], bytes]], replays: Sequence[ReplayedCandidate]
 ) -> dict[str, Any]:
     """Describe a stage, and add its arrays."""
     positions = stage.state_before.position if stage.positions is None else stage.positions
     poses = stage.state_before.tool_pose if stage.tool_poses is None else stage.tool_poses
-    name = f"stage-{stage.index}"
     arrays[f"{name}-positions"] = lambda: encode_frames(positions.double().numpy()[:, order])
     levels, low, high = encode_levels(stage.priorities.double().numpy()[order])
     known = bool(stage.priorities.isfinite().all())
@@ -126,15 +147,29 @@ def _stage(
         "lossBefore": stage.loss_before,
         "loss": stage.loss,
         "best": stage.best,
-        "candidates": _candidates(stage, order, arrays, replays),
+        "candidates": _candidates(stage, name, order, arrays, replays),
         "evaluations": stage.gradient_evaluations,
         "rollouts": stage.rollouts,
         "seconds": stage.seconds,
     }
 
 
+def _way(record: RunRecord, before: StageResult, stage: StageResult) -> list[Any]:
+    """Poses (P, M, 8) of the tools on their way from one stage to the next; empty where they stay."""
+    if before.tool_poses is None or stage.tool_poses is None:
+        return []
+    ends, starts, clay = before.tool_poses[-1].double(), stage.tool_poses[0].double(), stage.state_before.position[0].double()
+    ways = [
+        way(tool, end, start, clay) if tool.movable else end.expand(1, -1)
+        for tool, end, start in zip(record.task.scene.tools, ends, starts, strict=True)
+    ]
+    longest = max((len(poses) for poses in ways), default=0)
+    whole = np.stack([poses.expand(longest, -1) if len(poses) == 1 else poses for poses in ways], axis=1) if ways else np.empty(0)
+    return _poses(np.concatenate([whole[:-1:WAY_EVERY], whole[-1:]]))
+
+
 def _candidates(
-    stage: StageResult, order: Any, arrays: dict[str, Callable[[], bytes]], replays: Sequence[ReplayedCandidate]
+    stage: StageResult, prefix: str, order: Any, arrays: dict[str, Callable[[], bytes]], replays: Sequence[ReplayedCandidate]
 ) -> list[dict[str, Any]]:
     """Describe all candidates of a stage; those that were rolled out get positions, the others only the tools' placement."""
     known = {replay.number: replay for replay in replays}
@@ -150,7 +185,7 @@ def _candidates(
             "frames": 1,
         }
         if replay is not None:
-            name = f"stage-{stage.index}-candidate-{number}"
+            name = f"{prefix}-candidate-{number}"
             arrays[name] = _frames(replay.positions, order)
             entry |= {"poses": _poses(replay.poses), "positions": name, "frames": len(replay.positions)}
         described.append(entry)

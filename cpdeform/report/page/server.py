@@ -56,7 +56,7 @@ class LiveRun:
         make = page.arrays.get(name)
         if make is None:
             return None
-        # A stage that is recorded stays as it is, until another run takes the directory: its record begins at another time.
+        # An array of that name stays as it is, until another run takes the directory: its record begins at another time.
         key = (name, str(page.content["recorded"]))
         with self._lock:
             if key not in self._packed:

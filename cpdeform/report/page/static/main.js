@@ -30,10 +30,11 @@ function makeControls(player) {
     time.max = player.lastTime;
     time.value = player.time;
     const { current, content } = player;
-    const step = Math.min(Math.floor(player.time), player.lastTime);
+    const step = Math.min(Math.max(Math.floor(player.time), 0), player.lastTime);
     const other = player.candidate === null ? "" : `, candidate ${player.candidate + 1} (lost)`;
+    const going = player.time < 0 ? ", tools on their way" : "";
     const resting = current.status === "finished" || current.status === "interrupted" ? "" : `, ${current.status.replaceAll("_", " ")}`;
-    const text = `stage ${current.index + 1} of ${content.stageCount}, step ${step} of ${player.lastTime}${other}${resting}`;
+    const text = `stage ${current.index + 1} of ${content.stageCount}, step ${step} of ${player.lastTime}${going}${other}${resting}`;
     if (find("caption").textContent !== text) find("caption").textContent = text;
   };
   document.addEventListener("keydown", (event) => {
@@ -86,7 +87,11 @@ async function follow(player) {
   player.setContent(content);
   drawAll(content);
   if (content.stages.length > before && following) await player.goTo(content.stages.length - 1, 0);
-  else if (content.stages.length) player.changed();
+  else if (content.stages.length) {
+    // A joint polish may have revised the stage.
+    await player.show();
+    player.changed();
+  }
 }
 
 async function start() {

@@ -2,6 +2,7 @@
 
 const STEPS_PER_SECOND = 8;
 const HOLD_SECONDS = 1;
+const WAY_SECONDS = 1.5;
 const MEASURED_SECONDS = 2;
 
 /** Positions on the way from one frame to the next, as lengths. */
@@ -43,6 +44,9 @@ class Player {
 
   get lastTime() { return Math.max(this.source.frames - 1, 0); }
 
+  /** Where the time of a stage begins: below zero while the tools are on their way from the stage before. */
+  get firstTime() { return this.current.way?.length && this.candidate === null ? -WAY_SECONDS * STEPS_PER_SECOND : 0; }
+
   changed() { for (const listener of this.listeners) listener(); }
 
   async goTo(stage, time, candidate = null) {
@@ -75,21 +79,39 @@ class Player {
   /** Shows the moment. */
   async show() {
     const { current, source } = this;
-    const at = Math.min(Math.floor(this.time), Math.max(this.lastTime - 1, 0));
-    const share = Math.min(this.time, this.lastTime) - at;
-    const frames = await this.frames(source.positions);
-    const positions = mixed(frames[at], frames[Math.min(at + 1, frames.length - 1)], share);
-    const levels = this.colour === "priority" ? await this.levels(current) : null;
-    const field = this.colour === "error" ? await this.distanceField() : null;
-    const { nodes } = this.content.goal.distance;
-    this.view.clay.show(positions, { levels, place: field && ((places) => goalDistances(places, field, nodes)) });
+    const time = Math.max(this.time, 0);
+    const at = Math.min(Math.floor(time), Math.max(this.lastTime - 1, 0));
+    const share = Math.min(time, this.lastTime) - at;
+    await this.showClay(at, share);
     const posesOf = (poses) => [poses[Math.min(at, poses.length - 1)], poses[Math.min(at + 1, poses.length - 1)]];
     const other = this.candidate === null ? null : current.candidates[this.candidate];
-    this.view.showTools(this.view.tools, ...posesOf(current.poses), share);
+    if (this.time < 0) this.showWay(current.way, 1 - this.time / this.firstTime);
+    else this.view.showTools(this.view.tools, ...posesOf(current.poses), share);
     if (other) this.view.showTools(this.view.otherTools, ...posesOf(other.poses), share);
     for (const tool of this.view.tools) tool.mesh.visible = !(other && other.positions);
     for (const tool of this.view.otherTools) tool.mesh.visible = Boolean(other);
     this.view.stale = true;
+  }
+
+  /** Shows the clay between a frame and the next one, unless it is shown already. */
+  async showClay(at, share) {
+    const { source, colour } = this;
+    const key = [source.positions, at, share, colour, this.view.clay.asParticles].join();
+    if (key === this.shown) return;
+    const frames = await this.frames(source.positions);
+    const positions = mixed(frames[at], frames[Math.min(at + 1, frames.length - 1)], share);
+    const levels = colour === "priority" ? await this.levels(this.current) : null;
+    const field = colour === "error" ? await this.distanceField() : null;
+    const { nodes } = this.content.goal.distance;
+    this.view.clay.show(positions, { levels, place: field && ((places) => goalDistances(places, field, nodes)) });
+    this.shown = key;
+  }
+
+  /** Shows the tools on their way to the stage, of which a share lies behind them. */
+  showWay(way, share) {
+    const place = share * (way.length - 1);
+    const at = Math.min(Math.floor(place), way.length - 2);
+    this.view.showTools(this.view.tools, way[at], way[at + 1], place - at);
   }
 
   setColour(name) {
@@ -138,7 +160,7 @@ class Player {
     if (this.time >= this.lastTime + (last ? HOLD_SECONDS * STEPS_PER_SECOND : 0)) {
       if (last && this.candidate === null) this.stage = 0;
       else if (!last) this.stage += 1;
-      this.time = 0;
+      this.time = this.firstTime;
       await this.show();
       this.changed();
       return;
