@@ -98,6 +98,8 @@ def run(
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         # Libraries print to stdout, too; a reader of the JSON must not see that.
         result, directory = _execute(resolved, out, overwrite=overwrite, silent=as_json or quiet)
+        if not (no_pictures or as_json or quiet):
+            typer.echo("drawing the picture and the animation (up to two minutes; --no-pictures leaves them out)", err=True)
         picture = None if no_pictures else _draw(directory)
     if as_json:
         typer.echo(json.dumps(_summary(result, resolved, directory, resumed_from=resume)))

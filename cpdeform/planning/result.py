@@ -37,8 +37,8 @@ class Status(enum.Enum):
 _ADVICE = {
     Status.FINISHED: "",
     Status.NO_IMPROVEMENT: (
-        "No plan lowered the loss, so none was executed. Try another placer or seed, more iterations "
-        "(--iterations), or a larger blur (--set objective.blur=0.01)."
+        "No plan lowered the loss any further, so the last stage executed none. Try another strategy (--strategy sculpt), placer "
+        "or seed, more iterations (--iterations), or a larger blur (--set objective.blur=0.01)."
     ),
     Status.NO_PLACEMENT: (
         "The placer found no position of the tools that is within their bounds and free of collision with the body. "

@@ -84,7 +84,7 @@ def _make_view(task: Task, start: Array, goal: Array, tools: list[Array]) -> Vie
 
 
 def save_picture(canvas: Any, path: Path) -> None:
-    """Write a PNG file of 256 colours: a third of the size, and no difference to see.
+    """Write a PNG file of 256 colours, dithered: half of the size, and no difference to see.
 
     Args:
         canvas: A matplotlib canvas.
@@ -94,4 +94,5 @@ def save_picture(canvas: Any, path: Path) -> None:
 
     canvas.draw()
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-    picture.quantize(256, dither=Image.Dither.NONE).save(path, format="PNG", optimize=True)
+    palette = picture.quantize(256, kmeans=1)
+    picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(path, format="PNG", optimize=True)

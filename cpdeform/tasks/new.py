@@ -33,6 +33,8 @@ LONGEST_TOOL = 0.12
 BOARD_HEIGHT = 0.1
 DEPTH = 0.035
 """Height of a relief's board and depth of its black, domain edges: as in the task `writer`."""
+SUNK = 0.01
+"""How far below the lowest clay a tool may reach, domain edges: clay is pressed down a little where it lies."""
 FREE = 0.02
 """Room between clay and tools at the start, domain edges."""
 
@@ -184,10 +186,11 @@ def _tools(scene: Scene, request: Request, notes: list[str], *, pen: bool) -> li
         write_shape(path, make_grid(mesh))
         notes.append(f"The tool is {request.tool.name}, {_size(mesh.extents)} (domain edges).")
         place = [0.5, round(top + 0.5 * float(mesh.extents[1]), 5), 0.5]
-        return [{"kind": "Mesh", "file": path.name, "position": place, "friction": 0.9, "action_scale": _turning()}]
+        lowest = _above_floor(scene, 0.5 * float(mesh.extents[1]))
+        return [{"kind": "Mesh", "file": path.name, "position": place, **lowest, "friction": 0.9, "action_scale": _turning()}]
     if pen:
         place = [0.5, round(top + 0.05, 5), 0.5]
-        capsule = {"kind": "Capsule", "radius": 0.02, "height": 0.06, "position": place}
+        capsule = {"kind": "Capsule", "radius": 0.02, "height": 0.06, "position": place, **_above_floor(scene, 0.05)}
         return [{**capsule, "friction": 0.0, "action_scale": [0.01, 0.01, 0.01]}]
     half = [0.015, round(max(0.06, body.half_extents[1] + 0.02), 5), 0.05]
     blocks = []
@@ -198,9 +201,15 @@ def _tools(scene: Scene, request: Request, notes: list[str], *, pen: bool) -> li
             "half_extents": half,
             "rounding": 0.01,
             "position": [round(x, 5), round(body.position[1] + 0.02, 5), 0.5],
+            **_above_floor(scene, half[1] + 0.01),
         }
         blocks.append({**block, "friction": 0.9, "action_scale": _turning()})
     return blocks
+
+
+def _above_floor(scene: Scene, half_height: float) -> dict[str, Any]:
+    """Bounds of a tool that stands upright on the floor at the lowest; a hand or an arm would be in the floor below that."""
+    return {"lower_bound": [0.0, round(scene.resting_height - SUNK + half_height, 5), 0.0]}
 
 
 def _turning() -> list[float]:

@@ -9,6 +9,7 @@ COMMENTS = {
     "position": "middle; y is up, clay rests at a height of 0.047",
     "widths": "edges",
     "particle_count": "more particles take finer shapes and more time",
+    "lower_bound": "least x, y, z of its middle: upright it does not dip into the floor",
     "friction": "against the clay; 0 slips",
     "action_scale": "the most it moves in a step along x, y, z, and turns about them in radians",
     "half_extents": "half edges, without the rounding",

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from cpdeform.cli.main import app
+from cpdeform.core.clearance import tool_half_extents
 from cpdeform.core.errors import InputError
 from cpdeform.core.meshes.filling import even_points
 from cpdeform.core.sampling import sample_particles
@@ -67,6 +69,12 @@ def test_a_block_and_two_tools_where_nothing_else_is_given(meshes: Path) -> None
     assert body.volume == pytest.approx(4.0 / 3.0 * np.pi * (0.5 * np.ptp(task.load_goal()[:, 0])) ** 3, rel=0.3)
     assert [tool.kind for tool in task.scene.tools] == ["Box", "Box"]
     assert all(tool.movable for tool in task.scene.tools)
+    # Tools that stand upright stay out of the floor.
+    for tool in task.scene.tools:
+        reach = float(tool_half_extents(tool, torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64))[1])
+        assert tool.lower_bound[1] - reach > 0.0
+        assert tool.lower_bound[1] - reach == pytest.approx(task.scene.resting_height, abs=0.011)
+        assert tool.position[1] >= tool.lower_bound[1]
 
 
 def test_a_picture_becomes_a_relief_for_a_pen(tmp_path: Path) -> None:

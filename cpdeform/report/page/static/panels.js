@@ -2,6 +2,8 @@
 
 const FIGURE_HEAD = ["figure", "start", "result", "bound", "", ""];
 
+function counted(number, noun) { return `${number} ${noun}${number === 1 ? "" : "s"}`; }
+
 function drawHeader(content) {
   const good = ["finished", "running"].includes(content.status);
   find("header").replaceChildren(
@@ -39,7 +41,7 @@ function drawCandidates(stage, chosen, choose) {
     );
     return row;
   });
-  const before = element("div", { class: "muted" }, `loss before ${short(stage.lossBefore)}; ${stage.evaluations} gradient evaluations, ${stage.rollouts} rollouts`);
+  const before = element("div", { class: "muted" }, `loss before ${short(stage.lossBefore)}; ${counted(stage.evaluations, "gradient evaluation")}, ${counted(stage.rollouts, "rollout")}`);
   return place.replaceChildren(head, element("div", { class: "scroll" }, table(["placement", { number: "loss" }, ""], rows)), before);
 }
 
