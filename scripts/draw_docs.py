@@ -20,7 +20,7 @@ from cpdeform.tasks.draw_goals import SHEETS
 ROOT = Path(__file__).resolve().parents[1]
 DOCS, RUNS = ROOT / "docs", ROOT / "runs" / "pictures"
 PAGE_SIZE = (1280, 900)
-SCULPTED = {"star": "top", "airplane": "top", "bottle": "front"}
+SCULPTED = {"star": "top", "airplane": "top"}
 """Tasks of the picture of sculpted shapes, and where they are looked at from."""
 SHOWN = "#stage=12&step=10&colour=height&goal=1"
 
@@ -57,6 +57,8 @@ def draw_sculpted() -> None:
         titles = (f"{task}: start", "first touch", f"after {len(stages) // 2} touches", f"after {len(stages)}", "goal")
         for axis, title, cloud in zip(axes, titles, clouds, strict=True):
             draw_panel(axis, view, record, title, cloud.double(), first.tool_poses[-1] if title == "first touch" else None)
+            for arrow in list(axis.texts):
+                arrow.remove()
             shown = view.camera.project(cat([clouds[0], clouds[-1]]).double().numpy())
             low, high = shown.min(axis=0), shown.max(axis=0)
             margin = 0.25 * max(high[:2] - low[:2])
