@@ -10,8 +10,8 @@ from torch import Tensor
 
 from cpdeform.core.clearance import exit_distances, tool_half_extents
 from cpdeform.core.scene import Tool
+from cpdeform.core.tool_surface import placed_surface
 from cpdeform.placement.pose import turned
-from cpdeform.placement.tool import placed_surface
 
 LATERAL_REACH = 0.9
 """Offsets aside of the contact point, in the tool's half widths: the tool still faces the point."""

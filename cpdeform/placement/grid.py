@@ -14,7 +14,7 @@ from cpdeform.core.placer import Stage
 from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Tool
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.placement.tool import placed_surface, surface_points
+from cpdeform.core.tool_surface import placed_surface, surface_points
 
 
 @dataclasses.dataclass(frozen=True)

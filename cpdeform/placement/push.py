@@ -10,8 +10,8 @@ from torch import Tensor
 
 from cpdeform.core.clearance import CHUNK_DISTANCES, exit_distances, tool_half_extents
 from cpdeform.core.scene import Tool
+from cpdeform.core.tool_surface import placed_surface
 from cpdeform.placement.pose import turned
-from cpdeform.placement.tool import placed_surface
 
 REACH = 4.0
 """How far a tool may have to move out of the clay, in its half largest width: farther away it is not behind this clay any more."""

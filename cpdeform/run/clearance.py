@@ -12,7 +12,7 @@ from torch import Tensor
 from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Scene, Tool
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.placement.tool import surface_points
+from cpdeform.core.tool_surface import surface_points
 from cpdeform.planning.result import StageResult
 from cpdeform.run.record_reader import RunRecord
 

@@ -30,7 +30,7 @@ from cpdeform.core.shapes.box import ARC_POINTS, ShapeBox
 from cpdeform.core.shapes.kinds import BODIES, TOOLS
 from cpdeform.core.shapes.mesh import BodyMesh, ToolMesh
 from cpdeform.core.signed_distance import local_distance, signed_distance
-from cpdeform.placement.tool import surface_points
+from cpdeform.core.tool_surface import surface_points
 from cpdeform.report.shapes import tool_surface
 
 ORIGIN = (0.0, 0.0, 0.0)

@@ -24,7 +24,7 @@ from cpdeform.core.scene import (
     ToolTorus,
 )
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.placement.tool import surface_points
+from cpdeform.core.tool_surface import surface_points
 
 ORIGIN = (0.0, 0.0, 0.0)
 TOOLS: dict[str, Tool] = {

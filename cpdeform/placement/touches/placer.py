@@ -13,8 +13,8 @@ from cpdeform.core.ot import TransportProblem
 from cpdeform.core.placer import Candidate, Placer, PlacerCapabilities, Proposal, Stage
 from cpdeform.core.priorities import DISPLACEMENT_EXPONENT
 from cpdeform.core.scene import Scene, Tool, ToolRollingPin
+from cpdeform.core.tool_surface import surface_points
 from cpdeform.placement.grid import movable_tools
-from cpdeform.placement.tool import surface_points
 from cpdeform.placement.touches.draw import LONGEST_WAY, TouchDraw
 from cpdeform.placement.touches.together import label
 from cpdeform.placement.touches.touch import Room, Touch

@@ -8,7 +8,7 @@ from torch import Tensor
 from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Scene
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.placement.tool import surface_points
+from cpdeform.core.tool_surface import surface_points
 
 RESOLUTION = 9
 """Points of the lattice along each axis that a tool's surface is sampled by; odd, so that a round tool's poles are among them."""
@@ -17,7 +17,7 @@ RESOLUTION = 9
 class ToolCollisions:
     """How deep movable tools reach below the floor and into other tools, summed over a plan's environment steps.
 
-    A tool's surface is a sample of points (`cpdeform.placement.tool.surface_points`); its depth d is that of the deepest one, in
+    A tool's surface is a sample of points (`cpdeform.core.tool_surface.surface_points`); its depth d is that of the deepest one, in
     cells of the grid. It costs d^2 / 2 up to a cell and d - 1/2 beyond (Huber [1]_): a steeper cost near zero would drown the rest
     of the gradient in the momentum of a descent wherever a tool slides along the floor. Where the scene itself puts a tool below
     the floor, only what lies deeper counts. A tool that stands still costs nothing: it is taken away before the next stage.
@@ -51,7 +51,7 @@ class ToolCollisions:
             for other, neighbour in enumerate(self._scene.tools):
                 if other != index:
                     depths.append(-signed_distance(neighbour, tool_poses[:, 1:, other], points).amin(dim=-1))
-            total = total + sum(self._of_depths(depth) * moves for depth in depths).sum(dim=-1)
+            total = total + (self._of_depths(torch.stack(depths)).sum(dim=0) * moves).sum(dim=-1)
         return total
 
     def _of_depths(self, depths: Tensor) -> Tensor:

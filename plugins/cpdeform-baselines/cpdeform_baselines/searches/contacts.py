@@ -8,11 +8,11 @@ from torch import Tensor
 from cpdeform.core.clearance import exit_distances, reduce_distances
 from cpdeform.core.placer import Stage
 from cpdeform.core.scene import Tool
+from cpdeform.core.tool_surface import placed_surface
 from cpdeform.placement.grasp import TOOLS_PER_GRASP, GraspSearch
 from cpdeform.placement.grid import movable_tools
 from cpdeform.placement.pose import GRASP_DIRECTIONS
 from cpdeform.placement.random import surface_particles
-from cpdeform.placement.tool import placed_surface
 
 NEIGHBOURS = 48
 """Particles that the direction off the surface is taken from."""
