@@ -1,4 +1,4 @@
-"""The extent and the surface of a tool, for collision tests."""
+"""The surfaces of tools as points, and how far these are from other tools."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from torch import Tensor
 
 from cpdeform.core.clearance import tool_half_extents
 from cpdeform.core.rotation import rotate
-from cpdeform.core.scene import Tool, ToolMesh
+from cpdeform.core.scene import Scene, Tool, ToolMesh
 from cpdeform.core.shapes.tool import shape_of
-from cpdeform.core.signed_distance import local_distance
+from cpdeform.core.signed_distance import local_distance, signed_distance
 
 
 def surface_points(tool: Tool, *, resolution: int = 12) -> Tensor:
@@ -37,3 +37,39 @@ def surface_points(tool: Tool, *, resolution: int = 12) -> Tensor:
 def placed_surface(tool: Tool, pose: Tensor) -> Tensor:
     """Points (P, 3) all over the surface of a tool with the given pose (8,), world frame, length units."""
     return rotate(pose[3:7], surface_points(tool, resolution=24).to(pose)) + pose[:3]
+
+
+class ToolSurfaces:
+    """Points on the surfaces of a scene's tools, for any number of poses at once; differentiable with respect to these.
+
+    Args:
+        scene: Its tools, M of them.
+        resolution: See `surface_points`.
+    """
+
+    def __init__(self, scene: Scene, *, resolution: int = 12) -> None:
+        self._tools = scene.tools
+        self._points = [surface_points(tool, resolution=resolution) for tool in scene.tools]
+
+    def lowest(self, index: int, poses: Tensor) -> Tensor:
+        """Height (...) of the lowest point of one tool, length units, with the poses (..., M, 8) of all tools."""
+        return self._placed(index, poses)[..., 1].amin(dim=-1)
+
+    def gaps(self, index: int, poses: Tensor) -> Tensor:
+        """Distance (..., M - 1) of one tool from each of the others, length units, negative where they overlap.
+
+        It is that of the tool's points from the other tool's surface.
+
+        Args:
+            index: The tool.
+            poses: Poses (..., M, 8) of all tools.
+        """
+        points = self._placed(index, poses)
+        others = [other for other in range(len(self._tools)) if other != index]
+        gaps = [signed_distance(self._tools[other], poses[..., other, :], points).amin(dim=-1) for other in others]
+        return torch.stack(gaps, dim=-1) if gaps else poses.new_empty(*poses.shape[:-2], 0)
+
+    def _placed(self, index: int, poses: Tensor) -> Tensor:
+        """The points (..., P, 3) of a tool, world frame."""
+        pose = poses[..., index, None, :]
+        return rotate(pose[..., 3:7], self._points[index].to(poses)) + pose[..., :3]

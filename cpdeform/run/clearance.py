@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -12,12 +12,15 @@ from torch import Tensor
 from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Scene, Tool
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.core.tool_surface import surface_points
+from cpdeform.core.tool_surface import ToolSurfaces, surface_points
 from cpdeform.planning.result import StageResult
 from cpdeform.run.record_reader import RunRecord
 
 WAY_STEPS = 16
 """Poses that each of the three parts of a way is looked at in."""
+
+WAY_POSES = 3 * WAY_STEPS
+"""Poses of a whole way."""
 
 WAY_HEIGHT = 0.02
 """How far above the clay tools pass over it, length units."""
@@ -54,18 +57,18 @@ def measure_clearances(record: RunRecord) -> Clearances:
         return Clearances(clearance_start=None, clearance_tools=None, clearance_floor=None, clearance_way=None)
     scene = record.task.scene
     floor = min(float(stage.state_before.position[0, :, 1].min()) for stage in stages)
-    surfaces = [surface_points(tool) for tool in scene.tools]
+    surfaces, movable = ToolSurfaces(scene), [index for index, tool in enumerate(scene.tools) if tool.movable]
     paths = torch.cat([_executed(stage)[1] for stage in stages])
     return Clearances(
         clearance_start=min(_at_the_starts(scene, stages), default=None),
-        clearance_tools=min(_between_tools(scene, surfaces, paths), default=None),
-        clearance_floor=min(_above_floor(scene, surfaces, paths, floor), default=None),
+        clearance_tools=_least(surfaces.gaps(index, paths) for index in movable),
+        clearance_floor=_least(surfaces.lowest(index, paths) - floor for index in movable),
         clearance_way=min(_on_the_way(scene, stages), default=None),
     )
 
 
 def way(tool: Tool, end: Tensor, start: Tensor, clay: Tensor) -> Tensor:
-    """Poses (P, 8) on the way from one stage's end to the next one's start: up, over the clay, down.
+    """Poses (`WAY_POSES`, 8) on the way from one stage's end to the next one's start: up, over the clay, down.
 
     Args:
         tool: The tool.
@@ -100,30 +103,17 @@ def _to_clay(tool: Tool, pose: Tensor, clay: Tensor) -> float:
     return float(signed_distance(tool, pose, clay).min())
 
 
+def _least(distances: Iterable[Tensor]) -> float | None:
+    """The least of all numbers; None where there is none."""
+    return min((float(found.min()) for found in distances if found.numel()), default=None)
+
+
 def _at_the_starts(scene: Scene, stages: Sequence[StageResult]) -> Iterator[float]:
     """Distance of each movable tool from the clay where each stage begins."""
     for stage in stages:
         clay, poses = _executed(stage)
         for tool, pose in _movable(scene, poses[0]):
             yield _to_clay(tool, pose, clay[0])
-
-
-def _between_tools(scene: Scene, surfaces: Sequence[Tensor], paths: Tensor) -> Iterator[float]:
-    """Least distance of each movable tool's surface from each other tool, over poses (P, M, 8)."""
-    for index, tool in enumerate(scene.tools):
-        if tool.movable:
-            points = rotate(paths[:, index, None, 3:7], surfaces[index]) + paths[:, index, None, :3]
-            for other, neighbour in enumerate(scene.tools):
-                if other != index:
-                    yield float(signed_distance(neighbour, paths[:, other], points).min())
-
-
-def _above_floor(scene: Scene, surfaces: Sequence[Tensor], paths: Tensor, floor: float) -> Iterator[float]:
-    """Least height of each movable tool above the floor, over poses (P, M, 8)."""
-    for index, tool in enumerate(scene.tools):
-        if tool.movable:
-            points = rotate(paths[:, index, None, 3:7], surfaces[index]) + paths[:, index, None, :3]
-            yield float(points[..., 1].min()) - floor
 
 
 def _on_the_way(scene: Scene, stages: Sequence[StageResult]) -> Iterator[float]:

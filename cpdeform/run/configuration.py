@@ -25,6 +25,7 @@ from cpdeform.core.old_names import current_options
 from cpdeform.core.plugins import AUTO
 from cpdeform.core.scene import FrozenModel
 from cpdeform.planning.objectives.contact import ContactKind
+from cpdeform.planning.objectives.shape import COLLISION_WEIGHT
 
 DEFAULT_STRATEGY = "cpdeform"
 DEFAULT_EXECUTOR = "processes"
@@ -89,7 +90,7 @@ class ObjectiveConfiguration(FrozenModel):
     axis_scale: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (1.0, 1.0, 1.0)
     contact: ContactKind = "plasticinelab"
     density_weight: NonNegativeFloat = 1.0
-    collision_weight: NonNegativeFloat = 0.02
+    collision_weight: NonNegativeFloat = COLLISION_WEIGHT
 
 
 class RefinementConfiguration(FrozenModel):

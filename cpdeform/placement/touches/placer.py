@@ -13,7 +13,7 @@ from cpdeform.core.ot import TransportProblem
 from cpdeform.core.placer import Candidate, Placer, PlacerCapabilities, Proposal, Stage
 from cpdeform.core.priorities import DISPLACEMENT_EXPONENT
 from cpdeform.core.scene import Scene, Tool, ToolRollingPin
-from cpdeform.core.tool_surface import surface_points
+from cpdeform.core.tool_surface import ToolSurfaces
 from cpdeform.placement.grid import movable_tools
 from cpdeform.placement.touches.draw import LONGEST_WAY, TouchDraw
 from cpdeform.placement.touches.together import label
@@ -188,7 +188,7 @@ def _begin(stage: Stage) -> _Search:
         particles=particles,
         poses=_out_of_the_way(stage, movable),
         floor=float(particles[:, 1].min()),
-        surfaces=tuple(surface_points(tool).to(particles) for tool in stage.scene.tools),
+        surfaces=ToolSurfaces(stage.scene),
     )
     seed = int(torch.randint(2**31, (1,), generator=stage.generator))
     edge = _clay_volume(stage.scene) ** (1.0 / 3.0)

@@ -14,7 +14,7 @@ from torch import Tensor
 from cpdeform.core.clearance import CLEARANCE, exit_distances, tool_half_extents
 from cpdeform.core.rotation import multiply, rotate
 from cpdeform.core.scene import Scene, Tool
-from cpdeform.core.signed_distance import signed_distance
+from cpdeform.core.tool_surface import ToolSurfaces
 
 LEAST_DEPTH = 5e-4
 """How deep a tool at the contact point has to reach into the clay, length units: otherwise it would pass it by."""
@@ -50,14 +50,14 @@ class Room:
         particles: All particles (N, 3), length units.
         poses: Poses (M, 8) of all tools at the stage's start.
         floor: Height of the lowest particle, length units: no tool goes below.
-        surfaces: Points (P, 3) all over the surface of each tool in its local frame, length units.
+        surfaces: Those of the tools.
     """
 
     scene: Scene
     particles: Tensor
     poses: Tensor
     floor: float
-    surfaces: tuple[Tensor, ...]
+    surfaces: ToolSurfaces
 
     @property
     def movable(self) -> list[int]:
@@ -98,12 +98,7 @@ class Room:
         poses = self.poses.clone()
         for index, move in moves.items():
             poses[index] = move.pose
-        for index in moves:
-            surface = rotate(poses[index, 3:7], self.surfaces[index]) + poses[index, :3]
-            for other, tool in enumerate(self.scene.tools):
-                if other != index and float(signed_distance(tool, poses[other], surface).min()) < BETWEEN_TOOLS:
-                    return False
-        return True
+        return all(bool((self.surfaces.gaps(index, poses) >= BETWEEN_TOOLS).all()) for index in moves)
 
 
 class Touch(abc.ABC):

@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Scene
-from cpdeform.core.signed_distance import signed_distance
-from cpdeform.core.tool_surface import surface_points
+from cpdeform.core.state import tool_pose
+from cpdeform.core.tool_surface import ToolSurfaces
 
 RESOLUTION = 9
 """Points of the lattice along each axis that a tool's surface is sampled by; odd, so that a round tool's poles are among them."""
@@ -31,27 +30,21 @@ class ToolCollisions:
     """
 
     def __init__(self, scene: Scene, *, floor: float) -> None:
-        self._scene, self._cell = scene, scene.node_distance
-        self._surfaces = [surface_points(tool, resolution=RESOLUTION) for tool in scene.tools]
-        self._floors = [floor] * len(scene.tools)
-        for index, tool in enumerate(scene.tools):
-            start = torch.tensor([*tool.position, *tool.rotation_wxyz], dtype=torch.float64)
-            self._floors[index] = min(floor, float(self._placed(index, start)[..., 1].min()))
+        self._cell = scene.node_distance
+        self._movable = [index for index, tool in enumerate(scene.tools) if tool.movable]
+        self._surfaces = ToolSurfaces(scene, resolution=RESOLUTION)
+        start = tool_pose(scene)
+        self._floors = {index: min(floor, float(self._surfaces.lowest(index, start))) for index in self._movable}
 
     def cost(self, tool_poses: Tensor) -> Tensor:
-        """Cost (B,) of tool poses (B, T+1, M, 8), summed over the steps in which a tool moves, and the tools; differentiable."""
+        """Cost (B,), dimensionless, of tool poses (B, T+1, M, 8), over the steps in which a tool moves; differentiable."""
         total = tool_poses.new_zeros(tool_poses.shape[0])
-        for index, tool in enumerate(self._scene.tools):
-            if not tool.movable:
-                continue
-            path = tool_poses[..., index, :]
-            moves = (path.detach().diff(dim=1) != 0.0).any(dim=-1)
-            points = self._placed(index, path[:, 1:])
-            depths = [self._floors[index] - points[..., 1].amin(dim=-1)]
-            for other, neighbour in enumerate(self._scene.tools):
-                if other != index:
-                    depths.append(-signed_distance(neighbour, tool_poses[:, 1:, other], points).amin(dim=-1))
-            total = total + (self._of_depths(torch.stack(depths)).sum(dim=0) * moves).sum(dim=-1)
+        poses = tool_poses[:, 1:]
+        for index in self._movable:
+            moves = (tool_poses[..., index, :].detach().diff(dim=1) != 0.0).any(dim=-1)
+            below = self._of_depths(self._floors[index] - self._surfaces.lowest(index, poses))
+            within = self._of_depths(-self._surfaces.gaps(index, poses)).sum(dim=-1)
+            total = total + ((below + within) * moves).sum(dim=-1)
         return total
 
     def _of_depths(self, depths: Tensor) -> Tensor:
@@ -60,7 +53,7 @@ class ToolCollisions:
         return torch.nn.functional.huber_loss(cells, torch.zeros_like(cells), reduction="none")
 
     def cost_and_gradient(self, tool_poses: Tensor) -> tuple[Tensor, Tensor]:
-        """`cost` (B,) and its gradient (B, T+1, M, 8)."""
+        """`cost` (B,) and its gradient (B, T+1, M, 8) by the poses."""
         poses = tool_poses.detach().requires_grad_()
         with torch.enable_grad():
             cost = self.cost(poses)
@@ -68,7 +61,3 @@ class ToolCollisions:
                 return cost.detach(), torch.zeros_like(poses)
             (gradient,) = torch.autograd.grad(cost.sum(), poses)
         return cost.detach(), gradient
-
-    def _placed(self, index: int, pose: Tensor) -> Tensor:
-        """Surface points (..., P, 3) of a tool with the poses (..., 7 or more)."""
-        return rotate(pose[..., None, 3:7], self._surfaces[index].to(pose)) + pose[..., None, :3]

@@ -13,7 +13,7 @@ from cpdeform.report.page.encoding import encode_frames, encode_levels, spatial_
 from cpdeform.report.page.shapes import Array, describe_goal, describe_tools
 from cpdeform.report.pictures import CLAY
 from cpdeform.report.surface import particle_spacing
-from cpdeform.run.clearance import way
+from cpdeform.run.clearance import WAY_POSES, way
 from cpdeform.run.command import command_of
 from cpdeform.run.record import RunRecord
 from cpdeform.run.record_files import to_json
@@ -156,16 +156,16 @@ def _stage(
 
 def _way(record: RunRecord, before: StageResult, stage: StageResult) -> list[Any]:
     """Poses (P, M, 8) of the tools on their way from one stage to the next; empty where they stay."""
-    if before.tool_poses is None or stage.tool_poses is None:
+    tools = record.task.scene.tools
+    if before.tool_poses is None or stage.tool_poses is None or not tools:
         return []
     ends, starts, clay = before.tool_poses[-1].double(), stage.tool_poses[0].double(), stage.state_before.position[0].double()
     ways = [
-        way(tool, end, start, clay) if tool.movable else end.expand(1, -1)
-        for tool, end, start in zip(record.task.scene.tools, ends, starts, strict=True)
+        way(tool, end, start, clay) if tool.movable else end.expand(WAY_POSES, -1)
+        for tool, end, start in zip(tools, ends, starts, strict=True)
     ]
-    longest = max((len(poses) for poses in ways), default=0)
-    whole = np.stack([poses.expand(longest, -1) if len(poses) == 1 else poses for poses in ways], axis=1) if ways else np.empty(0)
-    return _poses(np.concatenate([whole[:-1:WAY_EVERY], whole[-1:]]))
+    poses = np.stack(ways, axis=1)
+    return _poses(np.concatenate([poses[:-1:WAY_EVERY], poses[-1:]]))
 
 
 def _candidates(
