@@ -31,6 +31,12 @@ from cpdeform.planning.strategy import Parts, Strategy
 MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
 """How far a goal may fall and how much of its shape it has to keep to count as one at rest that hangs a little."""
 
+INTERIM_RATE, JOINT_RATE = 0.02, 0.03
+"""Step sizes of the joint descents, units of action. Larger ones first undo what the touches gained: a row of stages errs together."""
+
+JOINT_BACKTRACK = 10
+"""Iterations without a gain after which a joint descent goes back; sooner, it would lose its step size to the first hill."""
+
 SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
 
@@ -72,7 +78,7 @@ class StrategySculpt(Strategy):
         polished: tuple[int, int] = (5, 2),
         iterations: tuple[int, int] = (4, 8),
         together: int = 12,
-        joint_iterations: int = 60,
+        joint_iterations: int = 40,
         joint_every: int = 3,
         interim_iterations: int = 10,
         coarse: bool = True,
@@ -89,8 +95,8 @@ class StrategySculpt(Strategy):
         self.polished, self.iterations = tuple(polished), tuple(iterations)
         self.together, self.joint_every, self.coarse = together, joint_every, coarse
         self._interim, self._joint = (
-            TrajectoryOptimizer(iterations=count, learning_rate=0.06, pruner=PrunerNone(), backtrack=3, annealed=True)
-            for count in (interim_iterations, joint_iterations)
+            TrajectoryOptimizer(iterations=count, learning_rate=rate, pruner=PrunerNone(), backtrack=JOINT_BACKTRACK, annealed=True)
+            for count, rate in ((interim_iterations, INTERIM_RATE), (joint_iterations, JOINT_RATE))
         )
 
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
