@@ -77,7 +77,8 @@ class SettledGoal:
         drop: How far they were moved down, length units: the mean over the particles when they were let go as clay, but not below
             the ground.
         let_go: Where they came to rest as clay (M, 3), length units.
-        self_iou: Volume IoU of these two: 1 for a shape that clay keeps, less for one that sags or falls apart.
+        self_iou: Volume IoU of these two: 1 for a shape that clay keeps, less for one that sags or falls apart, 0 for one whose
+            clay left the finite numbers.
         steps: Environment steps until they rested.
         rests: Whether they did within the limit.
         residual: Motion of the fastest particle in the last step, cells per environment step.
@@ -299,6 +300,16 @@ def settle_goal(
     start = dataclasses.replace(start, position=goal.detach().to(start.position).unsqueeze(0).contiguous())
     found = rest(simulator, start, step_limit=step_limit, tolerance=tolerance, stray_share=stray_share, damped=damped)
     let_go = found.state.position[0].to(goal)
+    if not bool(torch.isfinite(let_go).all()):
+        return SettledGoal(
+            position=goal.detach().clone(),
+            drop=0.0,
+            let_go=let_go,
+            self_iou=0.0,
+            steps=found.steps[0],
+            rests=False,
+            residual=found.residual[0],
+        )
     # A shape that collapses sinks farther on average than it can be put down whole.
     room = float(goal[:, 1].min()) - simulator.scene.domain[0][1]
     drop = min(float((goal - let_go)[:, 1].double().mean()), max(room, 0.0))

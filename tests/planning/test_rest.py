@@ -172,3 +172,17 @@ def test_diverged_clay_does_not_rest():
     assert not torch.isfinite(found.state.position).all()
     assert found.rests == (False,)
     assert found.steps[0] < 8
+
+
+def test_a_goal_whose_clay_diverges_is_told_of(monkeypatch):
+    simulator = make_simulator(make_scene(count=50))
+    goal = simulator.initial_state().position[0]
+
+    def diverged(simulator, state, **options):
+        found = rest(simulator, state, **options)
+        return dataclasses.replace(found, state=dataclasses.replace(found.state, position=found.state.position * float("nan")))
+
+    monkeypatch.setattr("cpdeform.planning.rest.rest", diverged)
+    settled = settle_goal(simulator, goal, step_limit=1)
+    assert (settled.self_iou, settled.drop, settled.rests) == (0.0, 0.0, False)
+    torch.testing.assert_close(settled.position, goal)

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from cpdeform.backends.warp.simulator import SimulatorWarp
 from cpdeform.cli.main import app
 from cpdeform.core.errors import InputError
-from cpdeform.core.plugins import load_registry
+from cpdeform.core.plugins import Registry, load_registry
 from cpdeform.core.sampling import sample_particles
 from cpdeform.core.scene import Scene, Tool
 from cpdeform.core.task import Task, list_variants, read_task, task_path
@@ -25,6 +25,7 @@ from cpdeform.run.checks.check import check_task, check_tools, warn_about_tools
 from cpdeform.run.checks.finding import Finding
 from cpdeform.run.checks.goal_height import check_goal_below_floor, check_goal_floating
 from cpdeform.run.checks.goal_reach import check_goal_reach
+from cpdeform.run.checks.goal_rest import check_goal_rest
 from cpdeform.run.checks.goal_volume import check_goal_volume
 from cpdeform.run.checks.occupancy import filled_volume, filling_radius
 from cpdeform.run.checks.tool_size import bounding_radius, contact_reach, thickness
@@ -273,6 +274,25 @@ def test_a_goal_out_of_reach_is_told_of(tmp_path: Path) -> None:
     assert only(check_goal_reach(task_with(tmp_path, scene_with(THIN["plate"]), goal), clay, goal)).severity == "error"
 
 
+@pytest.mark.parametrize(("overhang", "falls"), [(0.0, False), (0.12, True)])
+def test_a_goal_that_tips_over_is_told_of(overhang: float, falls: bool) -> None:
+    scene = scene_with(material={"youngs_modulus": 2000.0, "yield_stress": 20.0}, grid_size=32, ground_height=0.1)
+    foot, top = scene.resting_height, 0.12
+    stem = box_points((0.5, foot + top / 2, 0.5), (0.1, top, 0.1), 500)
+    roof = box_points((0.5 + overhang, foot + top + 0.05, 0.5), (0.25, 0.1, 0.1), 1000)
+    findings = check_goal_rest(scene, np.concatenate([stem, roof]))
+    assert bool(findings) == falls
+    if falls:
+        assert only(findings).severity == "note"
+        assert "does not keep its shape" in findings[0].what
+
+
+def test_without_a_simulator_no_goal_is_let_go() -> None:
+    scene = scene_with()
+    empty = Registry(load_registry().manager, (), ())
+    assert check_goal_rest(scene, box_points((0.5, 0.8, 0.5), (0.1, 0.1, 0.1)), registry=empty) == []
+
+
 # Whole tasks --------------------------------------------------------------------------------------------------------------
 
 SHIPPED = sorted(load_registry().names("task"))
@@ -288,6 +308,7 @@ def test_the_tasks_that_come_with_it_have_no_fault(name: str) -> None:
         notes = check_task(task)
         assert [finding for finding in notes if finding.severity != "note"] == []
         kinds = {"move": {"goal floating"}, "triple-move": {"goal floating"}, "table": {"near bodies"}}
+        kinds["chopsticks"] = {"goal at rest"}  # the goal is held up by the chopsticks
         found = {finding.kind for finding in notes}
         assert found - {"goal detail"} == kinds.get(name, set())
         # Some of the paper's goals are thin: ends of ropes, legs of a table.

@@ -32,7 +32,7 @@ MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
 """How far a goal may fall and how much of its shape it has to keep to count as one at rest that hangs a little."""
 
 INTERIM_RATE, JOINT_RATE = 0.02, 0.03
-"""Step sizes of the joint descents, units of action. Larger ones first undo what the touches gained: a row of stages errs together."""
+"""Step sizes of the joint descents, units of action. Larger ones first undo what the touches have gained."""
 
 JOINT_BACKTRACK = 10
 """Iterations without a gain after which a joint descent goes back; sooner, it would lose its step size to the first hill."""

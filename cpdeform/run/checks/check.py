@@ -13,6 +13,7 @@ from cpdeform.run.checks.finding import Finding
 from cpdeform.run.checks.goal_detail import check_goal_detail
 from cpdeform.run.checks.goal_height import check_goal_below_floor, check_goal_floating
 from cpdeform.run.checks.goal_reach import check_goal_reach
+from cpdeform.run.checks.goal_rest import check_goal_rest
 from cpdeform.run.checks.goal_volume import check_goal_volume
 from cpdeform.run.checks.tool_speed import check_tool_speed
 from cpdeform.run.checks.tool_thickness import check_tool_thickness
@@ -37,11 +38,13 @@ def check_task(task: Task) -> list[Finding]:
     """
     task = limited_task(task)
     clay, goal = sample_particles(task.scene), task.load_goal()
+    floating = check_goal_floating(task.scene, goal)
     return [
         *check_tools(task.scene),
         *check_near_bodies(task.scene),
         *check_goal_volume(clay, goal),
-        *check_goal_floating(task.scene, goal),
+        *floating,
+        *([] if floating else check_goal_rest(task.scene, goal)),
         *check_goal_below_floor(task.scene, clay, goal),
         *check_goal_reach(task, clay, goal),
         *check_goal_detail(task.scene, goal),
