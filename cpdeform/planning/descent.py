@@ -16,22 +16,24 @@ class Descent:
 
     A step too large presses the tools too deep, the next ones lift them off the clay. There the gradient is small or zero, and
     Adam's momentum carries the tools farther away. A world whose loss was not the lowest so far for `backtrack` steps in a row is
-    put back to its best plan, forgets its momentum and goes on from there with half the step size. So is one whose loss or gradient
-    is not finite, at once.
+    put back to its best plan, forgets its momentum and goes on from there with half the step size. So is, at once, one whose loss
+    or gradient is not finite, or whose loss is more than `leap` above its best: who knocked the clay over does not find back.
 
     Args:
         actions: First actions (B, T, A).
         backtrack: Steps without a gain after which a world goes back; None for never, not even of a world that broke.
+        leap: Rise of the loss above the best one, as a share of it, after which a world goes back at once; None for none, as where
+            `backtrack` is.
 
     References:
         .. [1] Kingma, Ba, "Adam: A Method for Stochastic Optimization", ICLR 2015.
     """
 
-    def __init__(self, actions: Tensor, *, backtrack: int | None) -> None:
+    def __init__(self, actions: Tensor, *, backtrack: int | None, leap: float | None = None) -> None:
         # A parameter and a group for each world, since each has its own momentum and step size.
         self._worlds = [torch.nn.Parameter(world.detach().clone()) for world in actions]
         self._adam = torch.optim.Adam([{"params": [world]} for world in self._worlds])
-        self._backtrack = backtrack
+        self._backtrack, self._leap = backtrack, leap
         self._scales = [1.0] * len(self._worlds)
         self._idle = [0] * len(self._worlds)
         self._best: dict[int, tuple[float, Tensor, Tensor]] = {}
@@ -61,7 +63,7 @@ class Descent:
                 self._return(world)
             elif self._backtrack is not None:
                 self._note(world, value, slope)
-                if self._idle[world] >= self._backtrack:
+                if self._idle[world] >= self._backtrack or self._leapt(world, value):
                     self._return(world)
             self._adam.param_groups[world]["lr"] = learning_rate * self._scales[world]
         self._adam.step()
@@ -76,6 +78,11 @@ class Descent:
             self._idle[world] = 0
         else:
             self._idle[world] += 1
+
+    def _leapt(self, world: int, loss: float) -> bool:
+        """Whether the loss is too far above the world's best."""
+        best = self._best[world][0]
+        return self._leap is not None and loss - best > self._leap * abs(best)
 
     def _return(self, world: int) -> None:
         """Put the world back to its best plan, with that plan's gradient."""

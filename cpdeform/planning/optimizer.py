@@ -87,7 +87,10 @@ class TrajectoryOptimizer:
         pruner: Which worlds go on after each iteration; see `cpdeform.planning.pruner`.
         backtrack: Iterations without a gain after which a world goes back to its best plan, with half the step size, as it does at
             once where its loss is not finite; None for never. See `cpdeform.planning.descent.Descent`.
-        annealed: Whether the step size falls to zero along half a period of a cosine [1]_ instead of staying as it is.
+        leap: Rise of the loss above the best one, as a share of it, after which a world goes back at once; None for no limit.
+        warm_up: Iterations over which the step size grows to `learning_rate`. Adam's first steps are full ones in every action,
+            whatever its gradient: together they may undo what a long plan has gained.
+        annealed: Whether the step size falls to zero along half a period of a cosine [1]_ in the second half of the iterations.
 
     References:
         .. [1] Loshchilov, Hutter, "SGDR: Stochastic Gradient Descent with Warm Restarts", ICLR 2017.
@@ -100,14 +103,18 @@ class TrajectoryOptimizer:
     initial_noise: float = 0.01
     pruner: Pruner = dataclasses.field(default_factory=PrunerHalving)
     backtrack: int | None = 4
+    leap: float | None = None
+    warm_up: int = 1
     annealed: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "patience"):
+        for name in ("iterations", "patience", "warm_up"):
             whole_number(f"optimizer.{name}", getattr(self, name), least=1, most=MOST_COUNT)
         if self.backtrack is not None:
             whole_number("optimizer.backtrack", self.backtrack, least=1, most=MOST_COUNT)
         real_number("optimizer.learning_rate", self.learning_rate, least=1e-12, most=1e15, expected="a positive number")
+        if self.leap is not None:
+            real_number("optimizer.leap", self.leap, least=0.0, most=1e15, expected="zero or more")
         for name in ("tolerance", "initial_noise"):
             real_number(f"optimizer.{name}", getattr(self, name), least=0.0, most=1e15, expected="zero or more")
 
@@ -127,7 +134,9 @@ class TrajectoryOptimizer:
 
     def _rate(self, index: int) -> float:
         """Step size of an iteration, in units of action."""
-        return self.learning_rate * (0.5 + 0.5 * math.cos(math.pi * index / self.iterations) if self.annealed else 1.0)
+        rate = self.learning_rate * min(1.0, (index + 1) / self.warm_up)
+        done = 2.0 * index / self.iterations - 1.0
+        return rate * (0.5 + 0.5 * math.cos(math.pi * done)) if self.annealed and done > 0.0 else rate
 
     def minimize(
         self,
@@ -159,7 +168,7 @@ class TrajectoryOptimizer:
             The best plan of each world. A world that the pruner drops keeps its best plan so far and stops, as does one whose
             loss or gradient is not finite where it may not go back to a plan before.
         """
-        race = Race.begin(state, actions, backtrack=self.backtrack, warm=warm)
+        race = Race.begin(state, actions, backtrack=self.backtrack, leap=self.leap, warm=warm)
         if on_start is not None:
             on_start(race)
         evaluator, executor = Evaluator(simulator, objective), executor or ExecutorSerial()

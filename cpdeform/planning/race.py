@@ -45,14 +45,22 @@ class Race:
     evaluations: int = 0
 
     @classmethod
-    def begin(cls, state: State, actions: Tensor, *, backtrack: int | None, warm: Sequence[object] | None) -> Race:
-        """All worlds at their first actions (B, T, A)."""
+    def begin(
+        cls,
+        state: State,
+        actions: Tensor,
+        *,
+        backtrack: int | None,
+        warm: Sequence[object] | None,
+        leap: float | None = None,
+    ) -> Race:
+        """All worlds at their first actions (B, T, A); see `Descent` for `backtrack` and `leap`."""
         count = state.batch_size
         first = actions.detach().clone().to(state.position)
         worst = torch.full((count,), torch.inf, dtype=torch.float64)
         return cls(
             state=state,
-            descent=Descent(first, backtrack=backtrack),
+            descent=Descent(first, backtrack=backtrack, leap=leap),
             active=torch.arange(count),
             warm=[None] * count if warm is None else list(warm),
             best_actions=first,

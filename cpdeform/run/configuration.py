@@ -41,6 +41,8 @@ class OptimizerConfiguration(FrozenModel):
     initial_noise: NonNegativeFloat = 0.01
     pruner: Literal["halving", "none"] = "halving"
     backtrack: Count | None = 4
+    leap: NonNegativeFloat | None = None
+    warm_up: Count = 1
     annealed: bool = False
 
 

@@ -19,8 +19,8 @@ def evaluate(actions):
     return torch.tensor(loss), torch.tensor([slope, 2.0 * (second - 0.9)]).reshape(2, 1, 1)
 
 
-def descend(*, backtrack, steps, learning_rate=0.3):
-    descent, worlds = Descent(torch.zeros(2, 1, 1), backtrack=backtrack), torch.arange(2)
+def descend(*, backtrack, steps, learning_rate=0.3, leap=None):
+    descent, worlds = Descent(torch.zeros(2, 1, 1), backtrack=backtrack, leap=leap), torch.arange(2)
     path = [descent.actions(worlds)]
     for _ in range(steps):
         descent.step(worlds, *evaluate(path[-1]), learning_rate=learning_rate)
@@ -47,6 +47,13 @@ def test_it_comes_near_the_edge_and_goes_on_from_its_best_plan():
     for index in (first > EDGE).nonzero().flatten().tolist()[:-1]:
         best = float(first[:index][first[:index] <= EDGE].max())
         assert best < float(first[index + 1]) < float(first[index])
+
+
+@pytest.mark.parametrize(("leap", "returns"), [(0.9, True), (1.1, False)])
+def test_a_leap_of_the_loss_ends_its_patience(leap, returns):
+    """The first world's loss doubles in the first step."""
+    first, _ = descend(backtrack=4, steps=2, leap=leap).unbind(1)
+    assert (float(first[2]) == pytest.approx(0.15)) == returns
 
 
 def test_without_it_momentum_carries_the_tool_away():

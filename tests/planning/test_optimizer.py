@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from cpdeform_toy.simulator import SimulatorToy
@@ -223,6 +225,8 @@ def test_first_actions():
         {"iterations": 0},
         {"learning_rate": 0.0},
         {"backtrack": 0},
+        {"leap": -0.1},
+        {"warm_up": 0},
         {"patience": 0},
         {"tolerance": -1.0},
         {"initial_noise": float("nan")},
@@ -231,3 +235,19 @@ def test_first_actions():
 def test_refuses(options):
     with pytest.raises(InputError, match=f"optimizer.{next(iter(options))}"):
         TrajectoryOptimizer(**options)
+
+
+class Along(ObjectiveAutograd):
+    """How far the centre is from a wall along x: a constant slope."""
+
+    def loss(self, positions, tool_poses):
+        return 1.0 - positions[:, -1, :, 0].mean(dim=1)
+
+
+def test_the_step_size_rises_stays_and_falls(simulator, state):
+    """Where the slope is constant each of Adam's steps is as large as the step size: a loss falls by it in each of five actions."""
+    optimizer = TrajectoryOptimizer(iterations=9, learning_rate=0.04, warm_up=2, annealed=True, pruner=PrunerNone())
+    losses = [iteration.loss[0] for iteration in optimizer.minimize(simulator, state, zeros(), Along()).history]
+    steps = -torch.stack(losses).diff() / (5 * 0.02)
+    falling = [0.04 * (0.5 + 0.5 * math.cos(math.pi * share)) for share in (1 / 9, 3 / 9, 5 / 9)]
+    torch.testing.assert_close(steps, torch.tensor([0.02, 0.04, 0.04, 0.04, 0.04, *falling]).double(), rtol=1e-3, atol=0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 from torch import Tensor
@@ -31,11 +32,8 @@ from cpdeform.planning.strategy import Parts, Strategy
 MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
 """How far a goal may fall and how much of its shape it has to keep to count as one at rest that hangs a little."""
 
-INTERIM_RATE, JOINT_RATE = 0.02, 0.03
-"""Step sizes of the joint descents, units of action. Larger ones first undo what the touches have gained."""
-
-JOINT_BACKTRACK = 10
-"""Iterations without a gain after which a joint descent goes back; sooner, it would lose its step size to the first hill."""
+JOINT_DESCENT: Mapping[str, Any] = MappingProxyType({"learning_rate": 0.02, "warm_up": 3, "backtrack": 10, "leap": 0.2})
+"""How joint descents go. A row of stages errs together: larger first steps undo what the touches have gained."""
 
 SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
@@ -80,7 +78,7 @@ class StrategySculpt(Strategy):
         together: int = 12,
         joint_iterations: int = 40,
         joint_every: int = 3,
-        interim_iterations: int = 10,
+        interim_iterations: int = 15,
         coarse: bool = True,
         idle: int = 3,
     ) -> None:
@@ -95,8 +93,8 @@ class StrategySculpt(Strategy):
         self.polished, self.iterations = tuple(polished), tuple(iterations)
         self.together, self.joint_every, self.coarse = together, joint_every, coarse
         self._interim, self._joint = (
-            TrajectoryOptimizer(iterations=count, learning_rate=rate, pruner=PrunerNone(), backtrack=JOINT_BACKTRACK, annealed=True)
-            for count, rate in ((interim_iterations, INTERIM_RATE), (joint_iterations, JOINT_RATE))
+            TrajectoryOptimizer(iterations=count, pruner=PrunerNone(), annealed=True, **JOINT_DESCENT)
+            for count in (interim_iterations, joint_iterations)
         )
 
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
