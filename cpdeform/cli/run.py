@@ -41,9 +41,12 @@ def run(
         str | None, typer.Option(help="Simulator; auto: the fastest installed. Defaults to auto.", metavar="NAME")
     ] = None,
     ot: Annotated[str | None, typer.Option(help="Optimal-transport solver. Defaults to auto.", metavar="NAME")] = None,
-    placer: Annotated[str | None, typer.Option(help="Where tools are put. Defaults to transport.", metavar="NAME")] = None,
+    placer: Annotated[
+        str | None, typer.Option(help="Where tools are put. Defaults to what the strategy takes.", metavar="NAME")
+    ] = None,
     strategy: Annotated[
-        str | None, typer.Option(help="How to search, see `cpdeform strategies`. Defaults to cpdeform.", metavar="NAME")
+        str | None,
+        typer.Option(help="How to search, see `cpdeform strategies`. Defaults to auto: what fits the task.", metavar="NAME"),
     ] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda. Defaults to cpu.", metavar="NAME")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of first actions and random placements. Defaults to 0.")] = None,

@@ -10,6 +10,7 @@ from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Scene, Tool, ToolMesh
 from cpdeform.core.shapes.tool import shape_of
 from cpdeform.core.signed_distance import local_distance, signed_distance
+from cpdeform.core.state import tool_pose
 
 
 def surface_points(tool: Tool, *, resolution: int = 12) -> Tensor:
@@ -48,12 +49,20 @@ class ToolSurfaces:
     """
 
     def __init__(self, scene: Scene, *, resolution: int = 12) -> None:
-        self._tools = scene.tools
+        self._tools, self._start = scene.tools, tool_pose(scene)
         self._points = [surface_points(tool, resolution=resolution) for tool in scene.tools]
 
     def lowest(self, index: int, poses: Tensor) -> Tensor:
         """Height (...) of the lowest point of one tool, length units, with the poses (..., M, 8) of all tools."""
         return self._placed(index, poses)[..., 1].amin(dim=-1)
+
+    def floors(self, floor: float) -> dict[int, float]:
+        """How low each movable tool may reach, length units: to the floor, or as low as the scene itself puts it.
+
+        Args:
+            floor: Height of the floor, length units.
+        """
+        return {index: min(floor, float(self.lowest(index, self._start))) for index, tool in enumerate(self._tools) if tool.movable}
 
     def gaps(self, index: int, poses: Tensor) -> Tensor:
         """Distance (..., M - 1) of one tool from each of the others, length units, negative where they overlap.

@@ -27,7 +27,6 @@ from cpdeform.core.scene import FrozenModel
 from cpdeform.planning.objectives.contact import ContactKind
 from cpdeform.planning.objectives.shape import COLLISION_WEIGHT
 
-DEFAULT_STRATEGY = "cpdeform"
 DEFAULT_EXECUTOR = "processes"
 
 
@@ -120,15 +119,15 @@ class RunConfiguration(FrozenModel):
         task: Registered name or path of a YAML file.
         backend: Registered name of the simulator, or ``"auto"``: the fastest one that is installed.
         ot: Registered name of the transport solver, or ``"auto"``.
-        placer: Registered name of the placer.
+        placer: Registered name of the placer; defaults to what the strategy sets, else ``"transport"``.
         device: Where tensors live, ``"cpu"`` or ``"cuda"``.
         seed: Seed of first actions and random placements.
         stages: Number of stages; defaults to the task's own.
         steps: Environment steps of a stage; defaults to the task's own.
         rest_steps: Environment steps of rest after them; defaults to the task's own.
         goal: File of the goal instead of the task's own, e.g. one written by `cpdeform task import-grid`.
-        strategy: Registered name of the strategy: ``"cpdeform"``, or ``"paper"`` for Algorithm 1 to the letter. What it sets, the
-            user overrides.
+        strategy: Registered name of the strategy, or ``"auto"``: ``"sculpt"`` for tasks of several stages, ``"cpdeform"`` for those
+            of one, see `cpdeform.run.strategy_choice`; ``"paper"`` is Algorithm 1 to the letter. What it sets, the user overrides.
         workers: Processes that batches of candidates are spread over; the threads of each are its share of the cores, unless
             ``simulator_options.threads`` says otherwise.
         executor: Registered name of what computes the batches where there are several workers: ``"processes"`` of this machine, or
@@ -155,7 +154,7 @@ class RunConfiguration(FrozenModel):
     steps: Whole | None = Field(default=None, ge=1, le=MOST_STEPS)
     rest_steps: Whole | None = Field(default=None, ge=0, le=MOST_STEPS)
     goal: Path | None = None
-    strategy: str = DEFAULT_STRATEGY
+    strategy: str = AUTO
     workers: Workers = 1
     executor: str = DEFAULT_EXECUTOR
     optimizer: OptimizerConfiguration = OptimizerConfiguration()

@@ -53,8 +53,9 @@ def deform(
             The limits that a task puts on its tools count unless a simulator is given whose scene does not have them.
         ot_solver: A transport solver, a registered name, or ``"auto"``, the default; it gives the priorities and, unless
             `objective` is given, the loss.
-        placer: A placer or a registered name; defaults to ``"transport"``.
-        strategy: A strategy or a registered name; defaults to ``"cpdeform"``.
+        placer: A placer or a registered name; defaults to what the strategy sets, else ``"transport"``.
+        strategy: A strategy or a registered name; defaults to ``"auto"``, what fits the task, see
+            `cpdeform.run.strategy_choice.choose_strategy`.
         objective: The loss; defaults to what the settings describe. No refinement comes after a loss given as an object.
         optimizer: Finds actions; defaults to `TrajectoryOptimizer` with the strategy's settings. A refinement makes no more
             iterations than it.

@@ -45,6 +45,7 @@ from cpdeform.run.parts import (
 from cpdeform.run.record_reader import RunRecord
 from cpdeform.run.result import RunResult
 from cpdeform.run.resume import check_same_task, resumed_task, resumed_values
+from cpdeform.run.strategy_choice import choose_strategy
 from cpdeform.run.unused_options import warn_about_optimizer
 
 MAX_WORLDS = 16
@@ -285,14 +286,18 @@ def resolve(
         layers.append((Origin.RECORD, values))
         asked = validate(RunConfiguration, values, source="configuration")
     _check_names(asked, objects, registry=registry)
-    strategy = objects.strategy or registry.create("strategy", asked.strategy, **asked.strategy_options)
-    if record is None:
-        task = task if task is not None else load_task(asked.task, registry=registry)
-        task = _changed(_with_limits(task, strategy, objects), asked)
-    else:
-        task = changed_task(resumed_task(record), scene=asked.scene)
+    if record is not None:
+        task = resumed_task(record)
+    elif task is None:
+        task = load_task(asked.task, registry=registry)
+    name = asked.strategy
+    if name == AUTO:
+        name = choose_strategy(task, values, race=any((objects.strategy, objects.placer, objects.optimizer)))
+    strategy = objects.strategy or registry.create("strategy", name, **asked.strategy_options)
+    task = _changed(_with_limits(task, strategy, objects), asked) if record is None else changed_task(task, scene=asked.scene)
     settings = strategy.settings(task, placer=values.get("placer"))
-    configuration = validate(RunConfiguration, merge(settings, values), source=f"strategy {asked.strategy}: settings")
+    values = {**values, "strategy": name}
+    configuration = validate(RunConfiguration, merge(settings, values), source=f"strategy {name}: settings")
     layers.append((Origin.STRATEGY, settings))
     task_name = configuration.task if configuration.task.endswith((".yaml", ".yml")) else task.name
     configuration = configuration.model_copy(update={"task": task_name, **_chosen_parts(configuration, objects, registry=registry)})
@@ -318,7 +323,7 @@ def _origins(
 ) -> dict[str, str]:
     """Where each value comes from; names that "auto" or an object stands for, too."""
     origins = trace_origins(configuration.model_dump(mode="json"), layers)
-    origins |= {name: Origin.AUTO.value for name in ("backend", "ot") if getattr(asked, name) == AUTO}
+    origins |= {name: Origin.AUTO.value for name in ("backend", "ot", "strategy") if getattr(asked, name) == AUTO}
     parts = {
         "backend": objects.simulator,
         "ot": objects.ot_solver,

@@ -17,12 +17,14 @@ from cpdeform.core.placer import Stage
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.state import initial_state
 from cpdeform.core.task import changed_task, list_variants, load_task, task_path
+from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.result import StageResult, Status
 from cpdeform.planning.strategies.paper import PLACER_OPTIONS, StrategyPaper
 from cpdeform.planning.strategy import Strategy
 from cpdeform.report import draw_run
 from cpdeform.run.deform import deform
 from cpdeform.run.evaluation import evaluate_record
+from cpdeform.run.origins import Origin
 from cpdeform.run.record import RunRecorder
 from cpdeform.run.record_reader import load_record
 from cpdeform.run.resolve import PartObjects, resolve
@@ -283,3 +285,26 @@ def test_a_damaged_record_of_any_format_is_one_error(tmp_path, task, toy_entry_p
     file.write_text(json.dumps(json.loads(file.read_text()) | changes))
     with pytest.raises(InputError):
         resolve({}, record=load_record(tmp_path / "run"), registry=toys)
+
+
+@pytest.mark.parametrize(
+    ("task", "given", "strategy"),
+    [
+        ("star", {}, "sculpt"),
+        ("star", {"placer": "touch", "backend": "warp"}, "sculpt"),
+        ("star", {"placer": "transport"}, "cpdeform"),
+        ("star", {"optimizer": {"iterations": 3}}, "cpdeform"),
+        ("star", {"strategy": "paper"}, "paper"),
+        ("torus", {}, "cpdeform"),
+    ],
+)
+def test_the_strategy_follows_from_the_task_and_from_what_is_given(registry, task, given, strategy):
+    found = resolve({"task": task, **given}, registry=registry)
+    assert found.configuration.strategy == found.names["strategy"] == strategy
+    assert found.origins["strategy"] == (Origin.GIVEN.value if "strategy" in given else Origin.AUTO.value)
+    assert found.configuration.placer == given.get("placer", "touch" if strategy == "sculpt" else "transport")
+
+
+def test_with_an_optimizer_as_an_object_candidates_race(registry):
+    objects = PartObjects(optimizer=TrajectoryOptimizer(iterations=2))
+    assert resolve({"task": "star"}, registry=registry, objects=objects).configuration.strategy == "cpdeform"

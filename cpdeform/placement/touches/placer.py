@@ -183,12 +183,13 @@ def _command(tool: Tool, step: Tensor) -> Tensor:
 def _begin(stage: Stage) -> _Search:
     movable = movable_tools(stage)
     particles = stage.state.position[0].detach()
+    surfaces = ToolSurfaces(stage.scene)
     room = Room(
         scene=stage.scene,
         particles=particles,
         poses=_out_of_the_way(stage, movable),
-        floor=float(particles[:, 1].min()),
-        surfaces=ToolSurfaces(stage.scene),
+        floors=surfaces.floors(float(particles[:, 1].min())),
+        surfaces=surfaces,
     )
     seed = int(torch.randint(2**31, (1,), generator=stage.generator))
     edge = _clay_volume(stage.scene) ** (1.0 / 3.0)

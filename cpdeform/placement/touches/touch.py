@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -49,14 +50,14 @@ class Room:
         scene: Its tools.
         particles: All particles (N, 3), length units.
         poses: Poses (M, 8) of all tools at the stage's start.
-        floor: Height of the lowest particle, length units: no tool goes below.
+        floors: How low each movable tool may reach, by index, length units: to the lowest particle, or as low as the scene puts it.
         surfaces: Those of the tools.
     """
 
     scene: Scene
     particles: Tensor
     poses: Tensor
-    floor: float
+    floors: Mapping[int, float]
     surfaces: ToolSurfaces
 
     @property
@@ -78,10 +79,10 @@ class Room:
             direction: Unit vector (3,) in which the tool is to push.
 
         Returns:
-            The pose (8,); None where there is no room within the tool's bounds and above the floor.
+            The pose (8,); None where there is no room within the tool's bounds and above its floor.
         """
         tool = self.scene.tools[index]
-        low = self.floor + float(tool_half_extents(tool, rotation)[1])
+        low = self.floors[index] + float(tool_half_extents(tool, rotation)[1])
         start = contact.clone()
         start[1] = max(float(start[1]), low)
         way = {"reach": REACH, "clearance": CLEARANCE, "least_depth": LEAST_DEPTH}

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from cpdeform.core.scene import Scene
-from cpdeform.core.state import tool_pose
 from cpdeform.core.tool_surface import ToolSurfaces
 
 RESOLUTION = 9
@@ -33,8 +32,7 @@ class ToolCollisions:
         self._cell = scene.node_distance
         self._movable = [index for index, tool in enumerate(scene.tools) if tool.movable]
         self._surfaces = ToolSurfaces(scene, resolution=RESOLUTION)
-        start = tool_pose(scene)
-        self._floors = {index: min(floor, float(self._surfaces.lowest(index, start))) for index in self._movable}
+        self._floors = self._surfaces.floors(floor)
 
     def cost(self, tool_poses: Tensor) -> Tensor:
         """Cost (B,), dimensionless, of tool poses (B, T+1, M, 8), over the steps in which a tool moves; differentiable."""
