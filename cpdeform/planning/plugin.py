@@ -12,7 +12,7 @@ def cpdeform_strategies() -> list[PluginSpec]:
         PluginSpec(
             name="cpdeform",
             target="cpdeform.planning.strategies.cpdeform:StrategyCpdeform",
-            summary="contact points discovery, candidates race each other (the default)",
+            summary="contact points discovery, candidates race each other (the default for tasks of one stage)",
         ),
         PluginSpec(
             name="paper",
@@ -22,7 +22,7 @@ def cpdeform_strategies() -> list[PluginSpec]:
         PluginSpec(
             name="sculpt",
             target="cpdeform.planning.strategies.sculpt:StrategySculpt",
-            summary="many touches a stage, screened by rollouts, the best polished: shapes that one recognises",
+            summary="many touches a stage, screened by rollouts, the best polished (the default for tasks of several stages)",
         ),
         PluginSpec(
             name="look-ahead",
