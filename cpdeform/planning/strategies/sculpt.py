@@ -32,7 +32,7 @@ from cpdeform.planning.strategy import Parts, Strategy
 MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
 """How far a goal may fall and how much of its shape it has to keep to count as one at rest that hangs a little."""
 
-JOINT_DESCENT: Mapping[str, Any] = MappingProxyType({"learning_rate": 0.02, "warm_up": 3, "backtrack": 10, "leap": 0.2})
+JOINT_DESCENT: Mapping[str, Any] = MappingProxyType({"learning_rate": 0.02, "warm_up": 3, "backtrack": 10, "leap": 0.05})
 """How joint descents go. A row of stages errs together: larger first steps undo what the touches have gained."""
 
 SCREENED = 10_000
