@@ -28,6 +28,9 @@ SANITIZED := plugins/cpdeform-native/build/sanitized
 run: $(NATIVE)
 	$(BIN)/cpdeform run writer --out $(OUT) --overwrite
 
+# Several processes that each take all cores for themselves wait for each other most of the time.
+test quick: export OMP_NUM_THREADS := 1
+
 test: $(NATIVE)
 	$(BIN)/$(PYTEST)
 	$(MAKE) --no-print-directory --output-sync --jobs $(WORKERS) $(PLUGINS:%=test-%)
