@@ -1,7 +1,7 @@
 """Draw all pictures of README and docs: `make pictures`, or some: `python scripts/draw_docs.py writer page goals-multi-stage-1`.
 
-``writer`` is a run of the task writer, ``sculpted`` shows runs of some tasks with the strategy ``sculpt``, ``page`` is a
-screenshot of the page of one of them (a headless Chromium is needed); each of these runs takes about half an hour. The others are
+``writer`` is a run of the task writer, ``sculpted`` and ``sculpted-2`` show runs of tasks of several stages, ``page`` is a
+screenshot of the page of one of them (a headless Chromium is needed); each of these runs takes 10 to 30 minutes. The others are
 the sheets of all tasks. Runs are kept in ``runs/pictures``: those that are finished are drawn again without being made again.
 Delete the folder to make them anew.
 """
@@ -20,8 +20,10 @@ from cpdeform.tasks.draw_goals import SHEETS
 ROOT = Path(__file__).resolve().parents[1]
 DOCS, RUNS = ROOT / "docs", ROOT / "runs" / "pictures"
 PAGE_SIZE = (1280, 900)
-SCULPTED = {"star": "top", "airplane": "top"}
-"""Tasks of the picture of sculpted shapes, and where they are looked at from."""
+CAMERAS = {"star": "top", "airplane": "top", "bottle": "front", "rope++": "top", "move++": "top", "pinch": "default"}
+"""Tasks of the pictures of sculpted shapes, and where they are looked at from."""
+SCULPTED = {"sculpted": ("star", "airplane", "bottle"), "sculpted-2": ("rope++", "move++", "pinch")}
+"""Pictures and their rows: that of the README, and what the results page shows beside it."""
 SHOWN = "#stage=12&step=10&colour=height&goal=1"
 
 
@@ -32,7 +34,7 @@ def draw_writer() -> None:
     shrink((directory / "picture.png").read_bytes(), DOCS / "writer.png")
 
 
-def draw_sculpted() -> None:
+def draw_sculpted(picture: str) -> None:
     """A row a run: the start, the first touch with its tools, half of the touches, the result, and the goal."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -41,10 +43,11 @@ def draw_sculpted() -> None:
     from cpdeform.report.pictures import draw_panel, make_view
     from cpdeform.run.record_reader import load_record
 
-    figure = Figure(figsize=(12.5, 2.6 * len(SCULPTED)), dpi=80, layout="constrained", facecolor="white")
-    for (task, camera), axes in zip(SCULPTED.items(), figure.subplots(len(SCULPTED), 5, squeeze=False), strict=True):
-        record = load_record(run(task, "--strategy", "sculpt"))
-        view = make_view(record, camera=camera)
+    tasks = SCULPTED[picture]
+    figure = Figure(figsize=(12.5, 2.6 * len(tasks)), dpi=80, layout="constrained", facecolor="white")
+    for task, axes in zip(tasks, figure.subplots(len(tasks), 5, squeeze=False), strict=True):
+        record = load_record(run(task))
+        view = make_view(record, camera=CAMERAS[task])
         stages = [stage for stage in record.stages if stage.status.executed]
         first, half, last = stages[0], stages[len(stages) // 2 - 1], stages[-1]
         clouds = [
@@ -54,7 +57,7 @@ def draw_sculpted() -> None:
             last.state.position[0],
             record.goal,
         ]
-        titles = (f"{task}: start", "first touch", f"after {len(stages) // 2} touches", f"after {len(stages)}", "goal")
+        titles = (f"{task}: start", "first touch", f"after {len(stages) // 2}", f"after {len(stages)} touches", "goal")
         for axis, title, cloud in zip(axes, titles, clouds, strict=True):
             draw_panel(axis, view, record, title, cloud.double(), first.tool_poses[-1] if title == "first touch" else None)
             for arrow in list(axis.texts):
@@ -64,9 +67,9 @@ def draw_sculpted() -> None:
             margin = 0.25 * max(high[:2] - low[:2])
             axis.set_xlim(low[0] - margin, high[0] + margin)
             axis.set_ylim(low[1] - margin, high[1] + margin)
-    picture = io.BytesIO()
-    FigureCanvasAgg(figure).print_figure(picture, format="png")
-    shrink(picture.getvalue(), DOCS / "pictures" / "sculpted.png")
+    drawn = io.BytesIO()
+    FigureCanvasAgg(figure).print_figure(drawn, format="png")
+    shrink(drawn.getvalue(), DOCS / "pictures" / f"{picture}.png")
 
 
 def draw_page() -> None:
@@ -74,7 +77,7 @@ def draw_page() -> None:
     from cpdeform.report.page.write import write_page
     from cpdeform.testing.browser import Browser
 
-    page = write_page(run("star", "--strategy", "sculpt"))
+    page = write_page(run("star"))
     with Browser(width=PAGE_SIZE[0], height=PAGE_SIZE[1]) as browser:
         browser.open(page.as_uri() + SHOWN)
         browser.wait_for("document.documentElement?.dataset.ready")
@@ -87,12 +90,12 @@ def draw_sheet(name: str) -> None:
     subprocess.run([sys.executable, "-m", "cpdeform.tasks.draw_goals", *out], check=True)
 
 
-def run(task: str, *options: str) -> Path:
+def run(task: str) -> Path:
     """The record of a run, made unless it is there."""
     directory = RUNS / task
     record = directory / "run.json"
     if not record.exists() or json.loads(record.read_text(encoding="utf-8"))["status"] != "finished":
-        command("run", task, *options, "--no-pictures", "--overwrite", "--out", str(directory))
+        command("run", task, "--no-pictures", "--overwrite", "--out", str(directory))
     return directory
 
 
@@ -110,7 +113,8 @@ def command(*arguments: str) -> None:
 
 def main() -> None:
     """Draw what the command line names, or everything."""
-    makers: dict[str, Callable[[], None]] = {"writer": draw_writer, "sculpted": draw_sculpted, "page": draw_page}
+    makers: dict[str, Callable[[], None]] = {"writer": draw_writer, "page": draw_page}
+    makers |= {picture: lambda picture=picture: draw_sculpted(picture) for picture in SCULPTED}
     makers |= {name: lambda name=name: draw_sheet(name) for name in SHEETS}
     names = sys.argv[1:] or list(makers)
     if unknown := set(names) - set(makers):

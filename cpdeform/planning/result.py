@@ -37,7 +37,7 @@ class Status(enum.Enum):
 _ADVICE = {
     Status.FINISHED: "",
     Status.NO_IMPROVEMENT: (
-        "No plan lowered the loss any further, so the last stage executed none. Try another strategy (--strategy sculpt), placer "
+        "No plan lowered the loss any further, so the last stage executed none. Try another strategy (--strategy), placer "
         "or seed, more iterations (--iterations), or a larger blur (--set objective.blur=0.01)."
     ),
     Status.NO_PLACEMENT: (
