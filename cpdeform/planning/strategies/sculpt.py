@@ -32,8 +32,12 @@ from cpdeform.planning.strategy import Parts, Strategy
 MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
 """How far a goal may fall and how much of its shape it has to keep to count as one at rest that hangs a little."""
 
-JOINT_DESCENT: Mapping[str, Any] = MappingProxyType({"learning_rate": 0.02, "warm_up": 3, "backtrack": 10, "leap": 0.05})
-"""How joint descents go. A row of stages errs together: larger first steps undo what the touches have gained."""
+JOINT_DESCENT: Mapping[str, Any] = MappingProxyType({"warm_up": 3, "backtrack": 10, "leap": 0.05})
+"""How joint descents go: gently at first, and back at once where the loss leaps."""
+
+JOINT_STEP, LARGEST_STEP = 0.24, 0.06
+"""Adam's step size in a joint descent, times the number of stages, and the largest one, units of action. A row of stages errs
+together: the longer it is, the more of what the touches have gained a step undoes."""
 
 SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
@@ -92,10 +96,7 @@ class StrategySculpt(Strategy):
         self.touches, self.variations, self.idle = touches, variations, idle
         self.polished, self.iterations = tuple(polished), tuple(iterations)
         self.together, self.joint_every, self.coarse = together, joint_every, coarse
-        self._interim, self._joint = (
-            TrajectoryOptimizer(iterations=count, pruner=PrunerNone(), annealed=True, **JOINT_DESCENT)
-            for count in (interim_iterations, joint_iterations)
-        )
+        self._interim, self._joint = interim_iterations, joint_iterations
 
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
         """The placer of touches, and the loss that sees crumbs."""
@@ -127,9 +128,10 @@ class StrategySculpt(Strategy):
         efforts = []
         for chapter in _parts(range(stages), self.together):
             for part in _parts(chapter, self.joint_every):
-                optimizer = self._joint if part[-1] == chapter[-1] else self._interim
+                iterations = self._joint if part[-1] == chapter[-1] else self._interim
                 count = part[-1] + 1 - chapter[0]
-                efforts.append(JointEffort(after=part[-1] + 1, stages=count, iterations=optimizer.effort(1).gradients))
+                gradients = joint_optimizer(stages=count, iterations=iterations).effort(1).gradients
+                efforts.append(JointEffort(after=part[-1] + 1, stages=count, iterations=gradients))
         return tuple(efforts)
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult | Revision]:
@@ -154,10 +156,12 @@ class StrategySculpt(Strategy):
                     return
             finished += held
 
-    def _polished(self, planner: Planner, held: list[StageResult], optimizer: TrajectoryOptimizer) -> Iterator[Revision]:
+    def _polished(self, planner: Planner, held: list[StageResult], iterations: int) -> Iterator[Revision]:
         """The stages polished together, where the simulator can; nothing where no stage has a plan."""
-        if not takes_final_gradient(planner.simulator) or all(result.actions is None for result in held):
+        planned = sum(result.actions is not None for result in held)
+        if not (planned and takes_final_gradient(planner.simulator)):
             return
+        optimizer = joint_optimizer(stages=planned, iterations=iterations)
         try:
             yield Revision(tuple(polish_jointly(planner, held, optimizer)), JOINT_POLISH)
         except StagesInterrupted as interruption:
@@ -183,6 +187,12 @@ class StrategySculpt(Strategy):
         last = results[-self.idle :]
         stuck = len(last) == self.idle and all(result.status is not Status.FINISHED for result in last)
         return stuck or results[-1].status is Status.NON_FINITE
+
+
+def joint_optimizer(*, stages: int, iterations: int) -> TrajectoryOptimizer:
+    """The optimiser of a joint descent over a number of stages."""
+    rate = min(LARGEST_STEP, JOINT_STEP / stages)
+    return TrajectoryOptimizer(iterations=iterations, learning_rate=rate, pruner=PrunerNone(), annealed=True, **JOINT_DESCENT)
 
 
 def _parts(stages: range, size: int) -> list[range]:
