@@ -24,6 +24,8 @@ CAMERAS = {"star": "top", "airplane": "top", "bottle": "front", "rope++": "top",
 """Tasks of the pictures of sculpted shapes, and where they are looked at from."""
 SCULPTED = {"sculpted": ("star", "airplane", "bottle"), "sculpted-2": ("rope++", "move++", "pinch")}
 """Pictures and their rows: that of the README, and what the results page shows beside it."""
+ENDED = ("finished", "no_improvement")
+"""States of runs that need not be made again: in the second one the last stage found nothing more."""
 SHOWN = "#stage=12&step=10&colour=height&goal=1"
 
 
@@ -94,7 +96,7 @@ def run(task: str) -> Path:
     """The record of a run, made unless it is there."""
     directory = RUNS / task
     record = directory / "run.json"
-    if not record.exists() or json.loads(record.read_text(encoding="utf-8"))["status"] != "finished":
+    if not record.exists() or json.loads(record.read_text(encoding="utf-8"))["status"] not in ENDED:
         command("run", task, "--no-pictures", "--overwrite", "--out", str(directory))
     return directory
 
