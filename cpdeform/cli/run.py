@@ -56,7 +56,8 @@ def run(
         Path | None, typer.Option(help="Goal file instead of the task's own, see `cpdeform task import-grid`.", metavar="FILE")
     ] = None,
     iterations: Annotated[
-        int | None, typer.Option(help="Largest number of gradient steps per stage. Defaults to what fits the task.")
+        int | None,
+        typer.Option(help="Largest number of gradient steps per stage, not of touches. Defaults to what fits the task."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(help="Processes that the candidates of a stage are spread over. Defaults to 1.", metavar="N")

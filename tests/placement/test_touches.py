@@ -32,7 +32,7 @@ SHIFT = torch.tensor([0.05, 0.0, 0.0])
 def make_stage(*tools: dict, seed: int = 0, steps: int = 10) -> Stage:
     """A block whose right half is to move to the right, and tools above it."""
     body = {"kind": "box", "position": (0.5, 0.35, 0.5), "widths": (0.24, 0.1, 0.2), "particle_count": 1500}
-    placed = [{**tool, "position": (0.3 + 0.4 * number, 0.7, 0.5)} for number, tool in enumerate(tools)]
+    placed = [{"position": (0.3 + 0.4 * number, 0.7, 0.5), **tool} for number, tool in enumerate(tools)]
     scene = Scene.model_validate({"bodies": [body], "tools": placed, "ground_height": 0.27})
     state = initial_state(scene)
     right = state.position[0, :, :1] > 0.5
@@ -113,6 +113,17 @@ def test_there_is_no_room_below_the_floor_or_out_of_bounds() -> None:
     assert up.moves(room) is None
     assert level.moves(room) is None
     assert TouchPress(tool=0, contact=contact, direction=np.array([0.0, -1.0, 0.0]), way=0.02).moves(room) is not None
+
+
+def test_a_tool_that_the_scene_keeps_below_the_floor_may_stay_as_low() -> None:
+    """Such as the balls of rope++, whose bounds end lower than a ball on the floor."""
+    bounds = {"lower_bound": (0.0, 0.31, 0.0), "upper_bound": (1.0, 0.32, 1.0)}
+    low = {**BALL, **bounds, "position": (0.2, 0.315, 0.5)}
+    stage = make_stage(low, {**low, "position": (0.8, 0.315, 0.5)})
+    assert float(stage.state.position[0, :, 1].min()) + BALL["radius"] > bounds["upper_bound"][1]
+    proposals = PlacerTouch(count=8).ask(stage)
+    assert proposals
+    assert all(bool((proposal.pose[:, 1] >= 0.315 - 1e-5).all()) for proposal in proposals)
 
 
 def test_a_pinch_closes_from_both_sides() -> None:

@@ -20,7 +20,7 @@ from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.descent import PhaseDescent
 from cpdeform.planning.pruner import PrunerNone
 from cpdeform.planning.result import Observer, Status
-from cpdeform.planning.strategies.sculpt import StrategySculpt
+from cpdeform.planning.strategies.sculpt import StrategySculpt, joint_optimizer
 from cpdeform.run.deform import deform
 from cpdeform.run.record import RunRecorder, load_record
 
@@ -185,6 +185,11 @@ def test_the_estimate_counts_the_gradients_that_joint_descents_compute(task):
     counted = sum(effort.effort.gradients[1] for effort in efforts)
     assert result.gradient_evaluations == alone.gradient_evaluations + counted
     assert StrategySculpt(**changes).joint_efforts(SimulatorToy(task.scene), stages=3) == ()
+
+
+def test_the_longer_a_row_the_smaller_its_steps():
+    rates = [joint_optimizer(stages=stages, iterations=15).learning_rate for stages in (1, 4, 6, 12)]
+    assert rates == pytest.approx([0.06, 0.06, 0.04, 0.02])
 
 
 def test_stages_are_polished_on_the_way_and_once_more_at_the_end(task):

@@ -35,7 +35,7 @@ MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
 JOINT_DESCENT: Mapping[str, Any] = MappingProxyType({"warm_up": 3, "backtrack": 10, "leap": 0.05})
 """How joint descents go: gently at first, and back at once where the loss leaps."""
 
-JOINT_STEP, LARGEST_STEP = 0.24, 0.06
+JOINT_STEP, LARGEST_JOINT_STEP = 0.24, 0.06
 """Adam's step size in a joint descent, times the number of stages, and the largest one, units of action. A row of stages errs
 together: the longer it is, the more of what the touches have gained a step undoes."""
 
@@ -191,7 +191,7 @@ class StrategySculpt(Strategy):
 
 def joint_optimizer(*, stages: int, iterations: int) -> TrajectoryOptimizer:
     """The optimiser of a joint descent over a number of stages."""
-    rate = min(LARGEST_STEP, JOINT_STEP / stages)
+    rate = min(LARGEST_JOINT_STEP, JOINT_STEP / stages)
     return TrajectoryOptimizer(iterations=iterations, learning_rate=rate, pruner=PrunerNone(), annealed=True, **JOINT_DESCENT)
 
 

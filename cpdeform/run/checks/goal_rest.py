@@ -39,17 +39,16 @@ def check_goal_rest(scene: Scene, goal: NDArray[np.float64], *, registry: Regist
     except PluginError:
         return []
     chosen = np.random.default_rng(0).permutation(len(goal))[:SAMPLE]
-    # The clay of a simulator has at least a particle for each of its bodies.
-    count = max(len(chosen), len(scene.bodies))
-    if count != len(chosen):
+    if len(chosen) < len(scene.bodies):
+        # Clay has at least a particle for each body: too few to tell anything.
         return []
     # So few particles are not worth more than one thread.
     threads = {"threads": 1} if "threads" in (registry.option_names("simulator", name) or ()) else {}
-    scene_at_rest = rest_scene(scene, particle_count=count)
+    scene_at_rest = rest_scene(scene, particle_count=len(chosen))
     simulator = registry.create("simulator", name, scene=scene_at_rest, dtype=torch.float32, **threads)
     settled = settle_goal(simulator, torch.as_tensor(goal[chosen], dtype=torch.float32), step_limit=STEP_LIMIT)
     if not bool(torch.isfinite(settled.let_go).all()):
-        # Particles that lie far too dense: that is the volume's fault, which has a check of its own.
+        # A sample may be too thin to hold together where the goal itself does: nothing follows.
         return []
     ways = torch.linalg.vector_norm(settled.let_go - settled.position, dim=1) / scene.node_distance
     moved = ways > KEPT_CELLS
@@ -62,7 +61,7 @@ def check_goal_rest(scene: Scene, goal: NDArray[np.float64], *, registry: Regist
             "goal at rest",
             "goal",
             f"Let go as clay, the goal does not keep its shape: {share:.0%} of it moves by more than {KEPT_CELLS:g} cells, "
-            f"{float(ways.quantile(0.95)) * scene.node_distance:.2g} and less for 95%.",
+            f"and 95% of it by at most {float(ways.quantile(0.95)) * scene.node_distance:.2g}.",
             "Lay it on a broader side, or make thin parts thicker; keep it if the tools are to hold it.",
         )
     ]
