@@ -27,6 +27,19 @@ MOST_STEPS = 64
 BISECTIONS = 12
 """Halvings of the last step; they leave the tool within 1/4096 of it of touching."""
 
+MOST_PUSHES = 32
+"""Pushes off the nearest point after which a tool that still touches is given up: it is wedged in."""
+
+PUSHED_DEPTH, PUSHED_WAY = 0.9, 2.0
+"""The deepest that a tool may be in to be pushed out, and the farthest it is pushed, both in its half smallest width. One that is
+deeper in has clay on both sides, and no nearest side to leave by."""
+
+ROUNDING = 1e-6
+"""How much less than the clearance is enough, length units."""
+
+LEAST_SLOPE = 0.01
+"""Square of the part of a normal that is not downwards, below which pushing along it would lead nowhere."""
+
 GRAZING_DEPTH = 0.5
 """Depth at the start, in the tool's half smallest width, below which it only grazes the points and would not press on them."""
 
@@ -165,3 +178,44 @@ def exit_distances(
         high = torch.where(gaps_at(found, high - step) >= clearance, high - step, high)
     lengths[found] = high
     return lengths
+
+
+def push_out(tool: Tool, pose: Tensor, points: Tensor, *, clearance: float, touching: float) -> Tensor:
+    """Where a tool comes free of the points: pushed off the one that is deepest in it, time and again, never downwards.
+
+    It goes about as far as it is too near, so that a little deeper is moved a little farther.
+
+    Args:
+        tool: The tool.
+        pose: Its pose (8,).
+        points: Points (P, 3) to get free of, length units.
+        clearance: Distance that counts as free, length units.
+        touching: Distance at which it is left where it is at first, length units, at most the clearance.
+
+    Returns:
+        Position (3,), length units; infinity where it would not come free, or where `PUSHED_DEPTH` or `PUSHED_WAY` is not enough.
+    """
+    shape, quaternion, position = shape_of(tool), pose[3:7], pose[:3]
+    extents = tool_half_extents(tool, quaternion)
+    half_width = float(shape.half_extents(torch.eye(3, dtype=pose.dtype, device=pose.device)).min())
+    farthest = PUSHED_WAY * half_width
+    near = points[_within(points, position[None], extents + clearance + farthest)]
+    nowhere = torch.full_like(position, torch.inf)
+    for number in range(MOST_PUSHES):
+        if not len(near):
+            return position
+        distances, normals = shape.distance_and_gradient(rotate_inverse(quaternion, near - position))
+        nearest = int(distances.argmin())
+        distance = float(distances[nearest])
+        if distance >= (clearance - ROUNDING if number else touching):
+            return position
+        away = -rotate(quaternion, normals[nearest])
+        away[1] = away[1].clamp(min=0.0)
+        square = float(away.square().sum())
+        if square < LEAST_SLOPE or (number == 0 and -distance > PUSHED_DEPTH * half_width):
+            return nowhere
+        # The distance grows by the part of the step that goes along the normal.
+        position = position + ((clearance - distance) / square) * away
+        if float(torch.linalg.vector_norm(position - pose[:3])) > farthest:
+            return nowhere
+    return nowhere

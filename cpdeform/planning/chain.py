@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from cpdeform.core.clearance import CLEARANCE, exit_distances
+from cpdeform.core.clearance import CLEARANCE, exit_distances, push_out
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.final_gradient import takes_final_gradient
 from cpdeform.core.scene import Scene, Tool
@@ -21,8 +21,9 @@ from cpdeform.core.state import State
 FARTHEST = 0.3
 """How far a tool is moved out of the clay at most, length units."""
 
-ROUNDING = 1e-6
-"""How much nearer than its clearance a tool may begin, length units: one that was moved out is not moved again."""
+TOUCHING = 0.0
+"""Distance from the clay below which a tool is moved out of it, length units. It is less than the clearance that a tool was given,
+so that a small change of the stages before moves none, and one that was moved out is not moved again."""
 
 
 class SimulatorChain(Simulator):
@@ -141,7 +142,10 @@ def begin_stage(scene: Scene, state: State, poses: Tensor, actions: Tensor) -> S
 
 
 def moved_out(tool: Tool, pose: Tensor, motion: Tensor, particles: Tensor) -> Tensor:
-    """A tool's pose (8,), moved out of the clay by the shorter of two ways: against its motion, or upwards.
+    """A tool's pose (8,), moved out of the clay by the shortest of three ways: against its motion, upwards, or off its surface.
+
+    Most often a tool touches by a hair, as the stages before have changed a little: then it goes as little off the surface. By the
+    other two ways alone one beside a wall would be lifted over it, and the loss would leap.
 
     Args:
         tool: The tool.
@@ -158,13 +162,17 @@ def moved_out(tool: Tool, pose: Tensor, motion: Tensor, particles: Tensor) -> Te
     # A tool that begins to rise would go back through the floor.
     directions = [back / length, up] if length > 0.0 and float(back[1]) >= 0.0 else [up]
     lower, upper = pose.new_tensor(tool.lower_bound), pose.new_tensor(tool.upper_bound)
-    way = {"reach": FARTHEST, "clearance": CLEARANCE, "least_depth": ROUNDING - CLEARANCE}
+    way = {"reach": FARTHEST, "clearance": CLEARANCE, "least_depth": -TOUCHING}
+    places = [
+        pose[:3] + exit_distances(tool, pose[3:7], pose[None, :3], direction, particles, **way)[0] * direction
+        for direction in directions
+    ]
+    places.append(push_out(tool, pose, particles, clearance=CLEARANCE, touching=TOUCHING))
     found, shortest = pose, math.inf
-    for direction in directions:
-        gone = float(exit_distances(tool, pose[3:7], pose[None, :3], direction, particles, **way)[0])
-        position = pose[:3] + gone * direction
-        if gone < shortest and bool(((position >= lower) & (position <= upper)).all()):
-            found, shortest = torch.cat([position, pose[3:]]), gone
+    for place in places:
+        gone = float(torch.linalg.vector_norm(place - pose[:3]))
+        if gone < shortest and bool(((place >= lower) & (place <= upper)).all()):
+            found, shortest = torch.cat([place, pose[3:]]), gone
     return found
 
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from backend_cases import BACKENDS, CASES, actions_for, backend_class, stirred
 
-from cpdeform.core.clearance import CLEARANCE
+from cpdeform.core.clearance import CLEARANCE, push_out
 from cpdeform.core.errors import CapabilityError, InputError
-from cpdeform.core.scene import ToolSphere
+from cpdeform.core.scene import ToolBox, ToolSphere
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.simulator import Simulator, differentiable_rollout
 from cpdeform.planning.chain import SimulatorChain, begin_stage, moved_out
@@ -136,6 +136,38 @@ def test_the_shorter_way_out_is_taken(place, motion, way) -> None:
     # Where its bounds let it go neither way, it stays.
     bounded = tool.model_copy(update={"lower_bound": place, "upper_bound": place})
     assert torch.equal(moved_out(bounded, pose, torch.tensor(motion), clay), pose)
+
+
+def wall() -> torch.Tensor:
+    """Clay of a wall 0.04 thick and 0.3 high, in the plane x = 0.5."""
+    axes = [torch.linspace(low, high, count) for low, high, count in ((0.48, 0.52, 17), (0.1, 0.4, 76), (0.3, 0.7, 101))]
+    return torch.cartesian_prod(*axes)
+
+
+@pytest.mark.parametrize("motion", [(0.0, 0.0, 0.01), (0.01, 0.005, 0.0), (0.0, 0.0, 0.0), (-0.01, 0.0, 0.0)])
+@pytest.mark.parametrize("depth", [1e-5, 1e-3, 0.01])
+def test_a_tool_that_grazes_a_wall_leaves_it_by_the_way_it_came_in(motion, depth) -> None:
+    clay, half_extents = wall(), (0.015, 0.1, 0.1)
+    tool = ToolBox(half_extents=half_extents, position=(0.3, 0.25, 0.5), action_scale=(0.01, 0.01, 0.01))
+    pose = torch.tensor([0.48 - half_extents[0] + depth, 0.25, 0.5, 1.0, 0.0, 0.0, 0.0, 0.0])
+    gone = moved_out(tool, pose, torch.tensor(motion), clay)[:3] - pose[:3]
+    torch.testing.assert_close(gone, torch.tensor([-depth - CLEARANCE, 0.0, 0.0]), atol=2e-6, rtol=0.0)
+
+
+def test_a_tool_near_the_clay_stays_where_it_is() -> None:
+    clay = wall()
+    tool = ToolSphere(radius=0.03, position=(0.3, 0.25, 0.5), action_scale=(0.01, 0.01, 0.01))
+    pose = torch.tensor([0.48 - tool.radius - 0.1 * CLEARANCE, 0.25, 0.5, 1.0, 0.0, 0.0, 0.0, 0.0])
+    assert torch.equal(moved_out(tool, pose, torch.tensor([0.0, 0.0, 0.01]), clay), pose)
+
+
+def test_no_tool_is_pushed_down() -> None:
+    clay, radius = wall(), 0.03
+    clay = clay[clay[:, 1] > 0.2]
+    pose = torch.tensor([0.5, 0.2 - radius + 0.002, 0.5, 1.0, 0.0, 0.0, 0.0, 0.0])
+    tool = ToolSphere(radius=radius, position=(0.5, 0.2, 0.5), action_scale=(0.01, 0.01, 0.01))
+    # Below the wall down is the only way off its surface, in between two of its points sideways.
+    assert float(push_out(tool, pose, clay, clearance=CLEARANCE, touching=0.0)[1]) >= float(pose[1])
 
 
 def test_what_cannot_be_chained_is_refused() -> None:

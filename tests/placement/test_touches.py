@@ -13,6 +13,7 @@ from cpdeform.core.rotation import rotate
 from cpdeform.core.scene import Scene
 from cpdeform.core.signed_distance import signed_distance
 from cpdeform.core.state import initial_state
+from cpdeform.placement.touches.parking import parked
 from cpdeform.placement.touches.pinch import TouchPinch
 from cpdeform.placement.touches.placer import PlacerTouch, place
 from cpdeform.placement.touches.push import TouchPress, TouchPush
@@ -124,6 +125,22 @@ def test_a_tool_that_the_scene_keeps_below_the_floor_may_stay_as_low() -> None:
     proposals = PlacerTouch(count=8).ask(stage)
     assert proposals
     assert all(bool((proposal.pose[:, 1] >= 0.315 - 1e-5).all()) for proposal in proposals)
+
+
+def test_tools_that_cannot_wait_above_the_clay_wait_beside_it() -> None:
+    bounds = {"lower_bound": (0.1, 0.31, 0.1), "upper_bound": (0.9, 0.37, 0.9)}
+    low = {**BALL, **bounds, "position": (0.2, 0.315, 0.5)}
+    # With two tools they would wait at x = 0.25 and 0.75, with one at 0.5: in the clay.
+    stage = make_stage(low)
+    (pose,) = parked(stage, [0])
+    gap = float(signed_distance(stage.scene.tools[0], pose, stage.state.position[0]).min())
+    assert gap > 0.2
+    assert bool((pose[:3] >= torch.tensor(bounds["lower_bound"])).all())
+    assert bool((pose[:3] <= torch.tensor(bounds["upper_bound"])).all())
+    assert parked(make_stage(BALL, BALL), [0, 1])[:, 1].tolist() == pytest.approx([0.9, 0.9])
+    crowd = make_stage(*3 * (low,))
+    poses = parked(crowd, [0, 1, 2])
+    assert float(torch.pdist(poses[:, :3]).min()) > 2.0 * BALL["radius"]
 
 
 def test_a_pinch_closes_from_both_sides() -> None:

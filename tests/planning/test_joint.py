@@ -20,6 +20,7 @@ from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.descent import PhaseDescent
 from cpdeform.planning.pruner import PrunerNone
 from cpdeform.planning.result import Observer, Status
+from cpdeform.planning.strategies import sculpt
 from cpdeform.planning.strategies.sculpt import StrategySculpt, joint_optimizer
 from cpdeform.run.deform import deform
 from cpdeform.run.record import RunRecorder, load_record
@@ -170,13 +171,13 @@ def test_the_strategy_polishes_two_stages_at_a_time(task):
 
 def test_the_estimate_counts_the_gradients_that_joint_descents_compute(task):
     """Neither stages nor descents stop early here, so that what is told at most is what is computed."""
-    changes = {"together": 2, "joint_every": 1, "joint_iterations": 5, "interim_iterations": 2}
+    changes = {"together": 3, "joint_every": 1, "joint_iterations": 5, "interim_iterations": 2}
     efforts = StrategySculpt(**changes).joint_efforts(SimulatorChained(task.scene), stages=3)
     found = [(effort.after, effort.stages, effort.iterations) for effort in efforts]
     assert found == [
         (1, 1, (2, 2)),
-        (2, 2, (5, 5)),
-        (3, 1, (5, 5)),
+        (2, 2, (2, 2)),
+        (3, 3, (5, 5)),
     ]
     result = sculpted(task, changes=changes)
     joint = sum(iteration.phase == PHASE for stage in result.stages for iteration in stage.history)
@@ -185,6 +186,19 @@ def test_the_estimate_counts_the_gradients_that_joint_descents_compute(task):
     counted = sum(effort.effort.gradients[1] for effort in efforts)
     assert result.gradient_evaluations == alone.gradient_evaluations + counted
     assert StrategySculpt(**changes).joint_efforts(SimulatorToy(task.scene), stages=3) == ()
+
+
+def test_few_stages_are_polished_again_as_long_as_it_pays(task, monkeypatch):
+    """At most as often as makes a whole row's gradients, which the estimate says."""
+    changes = {"together": 6, "joint_every": 3}
+    (effort,) = StrategySculpt(joint_iterations=5, **changes).joint_efforts(SimulatorChained(task.scene), stages=3)
+    assert effort.iterations == (5, 10)
+    counts = []
+    for worth in (-1.0, 1.0):
+        monkeypatch.setattr(sculpt, "WORTH_ANOTHER", worth)
+        result = sculpted(task, changes=changes)
+        counts.append(sum(iteration.phase == PHASE for stage in result.stages for iteration in stage.history))
+    assert counts == [10, 5]
 
 
 def test_the_longer_a_row_the_smaller_its_steps():
@@ -247,7 +261,8 @@ def test_a_record_holds_the_revised_stages(task, tmp_path):
     assert [stage.index for stage in early[0]] == [0, 1]
     assert record.stages[1].loss < early[0][1].loss
     revisions = [line for line in record.metrics if line["kind"] == "revision"]
-    assert [(line["stage"], line["stages"]) for line in revisions] == [(1, 2), (2, 1)]
+    # The third stage is a row of its own, and may have the gradients of two.
+    assert [(line["stage"], line["stages"]) for line in revisions] == [(1, 2), (2, 1), (2, 1)]
     assert revisions[0]["loss"] == record.stages[1].loss
     assert record.run["stages_finished"] == 3
 

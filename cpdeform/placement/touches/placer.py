@@ -16,6 +16,7 @@ from cpdeform.core.scene import Scene, Tool, ToolRollingPin
 from cpdeform.core.tool_surface import ToolSurfaces
 from cpdeform.placement.grid import movable_tools
 from cpdeform.placement.touches.draw import LONGEST_WAY, TouchDraw
+from cpdeform.placement.touches.parking import parked
 from cpdeform.placement.touches.together import label
 from cpdeform.placement.touches.touch import Room, Touch
 
@@ -146,7 +147,7 @@ def place(touch: Touch, room: Room, *, steps: int) -> tuple[Tensor, Tensor] | No
 
     Args:
         touch: The touch.
-        room: Clay and tools. Movable tools that take no part stay where they are, or are lifted where they would be in the way.
+        room: Clay and tools. Movable tools that take no part wait where they are in nobody's way.
         steps: Environment steps T.
     """
     moves = touch.moves(room)
@@ -187,7 +188,7 @@ def _begin(stage: Stage) -> _Search:
     room = Room(
         scene=stage.scene,
         particles=particles,
-        poses=_out_of_the_way(stage, movable),
+        poses=parked(stage, movable),
         floors=surfaces.floors(float(particles[:, 1].min())),
         surfaces=surfaces,
     )
@@ -206,14 +207,3 @@ def _begin(stage: Stage) -> _Search:
 
 def _clay_volume(scene: Scene) -> float:
     return sum(body.volume for body in scene.bodies)
-
-
-def _out_of_the_way(stage: Stage, movable: list[int]) -> Tensor:
-    """Poses (M, 8) with every movable tool high above the clay, where it is in nobody's way."""
-    poses = stage.state.tool_pose[0].detach().clone()
-    for number, index in enumerate(movable):
-        tool = stage.scene.tools[index]
-        lower, upper = poses.new_tensor(tool.lower_bound), poses.new_tensor(tool.upper_bound)
-        place = poses.new_tensor([(number + 0.5) / len(movable), 0.9, 0.5])
-        poses[index, :3] = place.clamp(lower, upper)
-    return poses

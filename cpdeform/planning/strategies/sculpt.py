@@ -39,6 +39,9 @@ JOINT_STEP, LARGEST_JOINT_STEP = 0.24, 0.06
 """Adam's step size in a joint descent, times the number of stages, and the largest one, units of action. A row of stages errs
 together: the longer it is, the more of what the touches have gained a step undoes."""
 
+WORTH_ANOTHER = 0.02
+"""Share of the loss that a joint descent at the end has to take off to be followed by another one."""
+
 SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
 
@@ -60,7 +63,7 @@ class StrategySculpt(Strategy):
         polished: Candidates of the first step of polishing, and of the second.
         iterations: Gradient evaluations of each of them in these steps.
         together: Stages that are polished together.
-        joint_iterations: Gradient evaluations of each of them in that.
+        joint_iterations: Gradient evaluations of each of them in one such descent.
         joint_every: Stages after which those found so far are polished together on the way.
         interim_iterations: Gradient evaluations of each of them in that.
         coarse: Whether touches are screened with fewer particles, where there are many; see `cpdeform.planning.coarse`.
@@ -128,10 +131,11 @@ class StrategySculpt(Strategy):
         efforts = []
         for chapter in _parts(range(stages), self.together):
             for part in _parts(chapter, self.joint_every):
-                iterations = self._joint if part[-1] == chapter[-1] else self._interim
+                last = part[-1] == chapter[-1]
                 count = part[-1] + 1 - chapter[0]
-                gradients = joint_optimizer(stages=count, iterations=iterations).effort(1).gradients
-                efforts.append(JointEffort(after=part[-1] + 1, stages=count, iterations=gradients))
+                least, most = joint_optimizer(stages=count, iterations=self._joint if last else self._interim).effort(1).gradients
+                rounds = self._rounds(count) if last else 1
+                efforts.append(JointEffort(after=part[-1] + 1, stages=count, iterations=(least, rounds * most)))
         return tuple(efforts)
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult | Revision]:
@@ -149,16 +153,24 @@ class StrategySculpt(Strategy):
                     yield result
                 over = self._is_over([*finished, *held])
                 last = over or part[-1] == stages[-1]
-                for revision in self._polished(planner, held, self._joint if last else self._interim):
-                    held = list(revision.results)
-                    yield revision
+                for _ in range(self._rounds(_planned(held)) if last else 1):
+                    before = held[-1].loss
+                    for revision in self._polished(planner, held, self._joint if last else self._interim):
+                        held = list(revision.results)
+                        yield revision
+                    if before - held[-1].loss < WORTH_ANOTHER * before:
+                        break
                 if over:
                     return
             finished += held
 
+    def _rounds(self, planned: int) -> int:
+        """The most joint descents at the end of a row, by its stages with a plan: few may have as many gradients as many."""
+        return max(1, self.together // max(planned, 1))
+
     def _polished(self, planner: Planner, held: list[StageResult], iterations: int) -> Iterator[Revision]:
         """The stages polished together, where the simulator can; nothing where no stage has a plan."""
-        planned = sum(result.actions is not None for result in held)
+        planned = _planned(held)
         if not (planned and takes_final_gradient(planner.simulator)):
             return
         optimizer = joint_optimizer(stages=planned, iterations=iterations)
@@ -193,6 +205,11 @@ def joint_optimizer(*, stages: int, iterations: int) -> TrajectoryOptimizer:
     """The optimiser of a joint descent over a number of stages."""
     rate = min(LARGEST_JOINT_STEP, JOINT_STEP / stages)
     return TrajectoryOptimizer(iterations=iterations, learning_rate=rate, pruner=PrunerNone(), annealed=True, **JOINT_DESCENT)
+
+
+def _planned(results: Sequence[StageResult]) -> int:
+    """How many stages have a plan."""
+    return sum(result.actions is not None for result in results)
 
 
 def _parts(stages: range, size: int) -> list[range]:
