@@ -64,6 +64,10 @@ def test_variations_of_one_touch_do_not_take_all_places():
     polish.run(bench, candidates([1.0, 2.0, 3.0, 4.0], ["push", "push", "push", "drag"]))
     assert MOST_ALIKE == 2
     assert bench.asked == [1.0, 2.0, 4.0]
+    each = PhasePolish(keep=4, optimizer=TrajectoryOptimizer(iterations=1), each_kind=True)
+    bench = Bench(0.5)
+    each.run(bench, candidates([1.0, 2.0, 3.0, 4.0, torch.inf], ["push", "push", "push", "drag", "press"]))
+    assert bench.asked == [1.0, 4.0, 2.0, 3.0]
     with pytest.raises(InputError, match="keep: got 0"):
         PhasePolish(keep=0, optimizer=TrajectoryOptimizer())
 
@@ -77,9 +81,9 @@ def test_a_run_by_touches(task):
     first = result.stages[0]
     assert first.status is Status.FINISHED
     assert result.loss_final < 0.6 * result.loss_initial
-    # Every candidate by a rollout, five and then two of them by gradients, and the execution.
+    # Every candidate by a rollout, ten and then two of them by gradients, and the execution.
     assert first.rollouts == len(first.candidates) + 1
-    assert first.gradient_evaluations <= 5 * 2 + 2 * 2
+    assert first.gradient_evaluations <= 10 * 2 + 2 * 2
     assert {iteration.phase for iteration in first.history} == {"polish"}
     assert {"touch"} == {result.configuration.placer}
     again = deform(task, strategy=strategy, settings=settings, **options, seed=1)

@@ -11,7 +11,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.placer import Candidate
 from cpdeform.planning.effort import Effort
 from cpdeform.planning.optimizer import TrajectoryOptimizer
-from cpdeform.planning.phases.choice import best_unlike
+from cpdeform.planning.phases.choice import best_of_each_kind, best_unlike
 from cpdeform.planning.phases.phase import Phase, Scope
 from cpdeform.planning.workbench import Workbench
 
@@ -24,6 +24,7 @@ class PhasePolish(Phase):
         keep: Number of candidates that are polished.
         optimizer: How.
         exclusive: Whether the others get an infinite loss: where their losses are estimates, no plan should be chosen by them.
+        each_kind: Whether the kinds of candidates take turns, the best of each first.
         name: The phase's name.
 
     Raises:
@@ -34,6 +35,7 @@ class PhasePolish(Phase):
     keep: int
     optimizer: TrajectoryOptimizer
     exclusive: bool = False
+    each_kind: bool = False
     name: str = "polish"
 
     def __post_init__(self) -> None:
@@ -46,7 +48,7 @@ class PhasePolish(Phase):
 
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
         """All candidates, the best of them with better plans; unless `exclusive`, a plan is never worse than before."""
-        chosen = best_unlike(candidates, self.keep)
+        chosen = (best_of_each_kind if self.each_kind else best_unlike)(candidates, self.keep)
         if not chosen:
             return candidates
         found = bench.minimize([candidates[number] for number in chosen], self.optimizer, None, phase=self.name)

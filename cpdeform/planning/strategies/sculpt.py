@@ -60,7 +60,7 @@ class StrategySculpt(Strategy):
     Args:
         touches: Random touches of a stage.
         variations: Touches of each of two rounds of variations.
-        polished: Candidates of the first step of polishing, and of the second.
+        polished: Candidates of the first step of polishing, in which all kinds of touches take their turn, and of the second.
         iterations: Gradient evaluations of each of them in these steps.
         together: Stages that are polished together.
         joint_iterations: Gradient evaluations of each of them in one such descent.
@@ -80,7 +80,7 @@ class StrategySculpt(Strategy):
         *,
         touches: int = 96,
         variations: int = 32,
-        polished: tuple[int, int] = (5, 2),
+        polished: tuple[int, int] = (10, 2),
         iterations: tuple[int, int] = (4, 8),
         together: int = 12,
         joint_iterations: int = 40,
@@ -119,7 +119,7 @@ class StrategySculpt(Strategy):
         return (
             PhaseScreening(keep=SCREENED),
             *(
-                PhasePolish(keep=keep, optimizer=optimizer, exclusive=number == 0)
+                PhasePolish(keep=keep, optimizer=optimizer, exclusive=number == 0, each_kind=number == 0)
                 for number, (keep, optimizer) in enumerate(optimizers)
             ),
         )
