@@ -68,6 +68,11 @@ def test_variations_of_one_touch_do_not_take_all_places():
     bench = Bench(0.5)
     each.run(bench, candidates([1.0, 2.0, 3.0, 4.0, torch.inf], ["push", "push", "push", "drag", "press"]))
     assert bench.asked == [1.0, 4.0, 2.0, 3.0]
+    # What screening left out, and what broke, is not polished even where there is room.
+    for kinds in (False, True):
+        bench = Bench(0.5)
+        dataclasses.replace(each, keep=9, each_kind=kinds).run(bench, candidates([torch.inf, 2.0, torch.nan, 1.0, -torch.inf]))
+        assert bench.asked == [1.0, 2.0]
     with pytest.raises(InputError, match="keep: got 0"):
         PhasePolish(keep=0, optimizer=TrajectoryOptimizer())
 

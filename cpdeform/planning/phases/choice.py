@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from cpdeform.core.placer import Candidate
 
@@ -19,7 +20,7 @@ def best_unlike(candidates: Sequence[Candidate], count: int) -> list[int]:
         candidates: All candidates of a search.
         count: How many, at most.
     """
-    losses = torch.tensor([candidate.loss for candidate in candidates], dtype=torch.float64).nan_to_num(nan=torch.inf)
+    losses = _losses(candidates)
     chosen: list[int] = []
     alike: dict[tuple[str, int | None], int] = {}
     for number in losses.argsort(stable=True).tolist():
@@ -43,7 +44,7 @@ def best_of_each_kind(candidates: Sequence[Candidate], count: int) -> list[int]:
         candidates: All candidates of a search.
         count: How many, at most.
     """
-    losses = torch.tensor([candidate.loss for candidate in candidates], dtype=torch.float64).nan_to_num(nan=torch.inf)
+    losses = _losses(candidates)
     ranked: list[tuple[int, int, int]] = []
     turns: dict[str, int] = {}
     for place, number in enumerate(losses.argsort(stable=True).tolist()):
@@ -53,3 +54,9 @@ def best_of_each_kind(candidates: Sequence[Candidate], count: int) -> list[int]:
         turns[kind] = turns.get(kind, 0) + 1
         ranked.append((turns[kind], place, number))
     return [number for _, _, number in sorted(ranked)[:count]]
+
+
+def _losses(candidates: Sequence[Candidate]) -> Tensor:
+    """Losses (C,) of candidates, infinite where they are not finite."""
+    losses = torch.tensor([candidate.loss for candidate in candidates], dtype=torch.float64)
+    return torch.where(torch.isfinite(losses), losses, torch.inf)
