@@ -20,9 +20,17 @@ from cpdeform.tasks.draw_goals import SHEETS
 ROOT = Path(__file__).resolve().parents[1]
 DOCS, RUNS = ROOT / "docs", ROOT / "runs" / "pictures"
 PAGE_SIZE = (1280, 900)
-CAMERAS = {"star": "top", "airplane": "top", "bottle": "front", "rope++": "top", "move++": "top", "pinch": "default"}
+CAMERAS = {
+    "star": "top",
+    "airplane": "top",
+    "bottle": "front",
+    "chair": "default",
+    "rope++": "top",
+    "move++": "top",
+    "pinch": "default",
+}
 """Tasks of the pictures of sculpted shapes, and where they are looked at from."""
-SCULPTED = {"sculpted": ("star", "airplane", "bottle"), "sculpted-2": ("rope++", "move++", "pinch")}
+SCULPTED = {"sculpted": ("star", "airplane", "bottle", "chair"), "sculpted-2": ("rope++", "move++", "pinch")}
 """Pictures and their rows: that of the README, and what the results page shows beside it."""
 ENDED = ("finished", "no_improvement")
 """States of runs that need not be made again: in the second one the last stage found nothing more."""
