@@ -28,7 +28,7 @@ BISECTIONS = 12
 """Halvings of the last step; they leave the tool within 1/4096 of it of touching."""
 
 MOST_PUSHES = 32
-"""Pushes off the nearest point after which a tool that still touches is given up: it is wedged in."""
+"""Pushes off the deepest point after which a tool that still touches is given up: it is wedged in."""
 
 PUSHED_DEPTH, PUSHED_WAY = 0.9, 2.0
 """The deepest that a tool may be in to be pushed out, and the farthest it is pushed, both in its half smallest width. One that is
@@ -200,10 +200,10 @@ def push_out(tool: Tool, pose: Tensor, points: Tensor, *, clearance: float, touc
     half_width = float(shape.half_extents(torch.eye(3, dtype=pose.dtype, device=pose.device)).min())
     farthest = PUSHED_WAY * half_width
     near = points[_within(points, position[None], extents + clearance + farthest)]
+    if not len(near):
+        return position
     nowhere = torch.full_like(position, torch.inf)
     for number in range(MOST_PUSHES):
-        if not len(near):
-            return position
         distances, normals = shape.distance_and_gradient(rotate_inverse(quaternion, near - position))
         nearest = int(distances.argmin())
         distance = float(distances[nearest])

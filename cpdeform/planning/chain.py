@@ -30,7 +30,7 @@ class SimulatorChain(Simulator):
     """A simulator whose rollout is a row of stages: between them the tools are lifted off and put to the next stage's poses.
 
     The clay goes on as the stage before left it. A tool that would begin a stage inside it, since the stages before have changed,
-    is first moved out, against its first motion or upwards. The gradient takes that way, and the poses, as fixed numbers.
+    is first moved out by the shortest way (`moved_out`). The gradient takes that way, and the poses, as fixed numbers.
 
     Args:
         simulator: Computes the stages; its `vjp` has to take `grad_final_state`.
