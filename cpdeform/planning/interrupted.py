@@ -100,9 +100,9 @@ def _candidates(bench: Workbench, *, searching: bool) -> list[Candidate]:
     if racing is None or racing.race is None or racing.objective is not bench.objective:
         return list(bench.candidates)
     race, found = racing.race, list(bench.candidates)
-    rows = zip(racing.candidates, race.best_loss.tolist(), race.best_actions, race.finite.tolist(), strict=True)
-    for candidate, loss, actions, finite in rows:
-        found.append(dataclasses.replace(candidate, loss=loss, actions=actions.clone(), finite=finite))
+    rows = zip(race.best_loss.tolist(), race.best_actions, race.finite.tolist(), strict=True)
+    for number, (loss, actions, finite) in enumerate(rows):
+        found.append(dataclasses.replace(racing.plan(number, actions.clone()), loss=loss, finite=finite))
     return found
 
 
@@ -113,4 +113,4 @@ def _refined(bench: Workbench, phase: Phase) -> Candidate | None:
         return None
     if racing.first_loss is None or not float(racing.race.best_loss[0]) < racing.first_loss:
         return None
-    return dataclasses.replace(racing.candidates[0], actions=racing.race.best_actions[0].clone())
+    return racing.plan(0, racing.race.best_actions[0].clone())

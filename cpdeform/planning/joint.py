@@ -13,18 +13,20 @@ from cpdeform.core.memory_limit import check_memory
 from cpdeform.core.placer import Candidate
 from cpdeform.core.state import State
 from cpdeform.planning.algorithm import Planner
-from cpdeform.planning.chain import SimulatorChain, begin_stage
+from cpdeform.planning.chain import SimulatorChain
 from cpdeform.planning.interrupted import StagesInterrupted
 from cpdeform.planning.optimizer import Iteration, TrajectoryOptimizer
+from cpdeform.planning.placed import Placing
 from cpdeform.planning.race import Race
 from cpdeform.planning.result import StageResult
+from cpdeform.planning.stage_start import begin_stage
 from cpdeform.planning.workbench import is_finite
 
 PHASE = "joint polish"
 
 
 def polish_jointly(planner: Planner, results: Sequence[StageResult], optimizer: TrajectoryOptimizer) -> list[StageResult]:
-    """Lower the loss at the end of several stages over the actions of all of them, and execute them anew.
+    """Lower the loss at the end of several stages over the actions and placements of all of them, and execute them anew.
 
     A stage that is planned alone is done when its own loss is low. Together they can prepare each other: the first one may leave
     clay where the second one takes it. An iteration costs a gradient a stage, and is counted so.
@@ -65,7 +67,7 @@ class _Descent:
     """What a descent came to, if only up to an interruption.
 
     Attributes:
-        actions: Best actions (K T, A) of K stages, one after the other.
+        actions: Best actions (K (rows + T), A) of K stages, one after the other, each after the rows that place its tools.
         gradients: Gradients of each stage.
         history: Its iterations.
         interruption: What broke it off; None for nothing.
@@ -85,8 +87,9 @@ class _Descent:
 def _minimize(planner: Planner, planned: Sequence[StageResult], optimizer: TrajectoryOptimizer) -> _Descent:
     """The descent, told to the observers as iterations of the last stage."""
     poses = torch.stack([_executed(result).proposal.pose for result in planned])
-    actions = torch.cat([result.actions for result in planned if result.actions is not None])
-    chain = SimulatorChain(planner.simulator, poses=poses, rest_steps=planner.task.rest_steps)
+    placing = Placing(scene=planner.task.scene)
+    actions = torch.cat([placing.before(result.actions) for result in planned if result.actions is not None])
+    chain = SimulatorChain(planner.simulator, poses=poses, rest_steps=planner.task.rest_steps, placing=placing)
     check_memory(chain, step_count=len(actions), worlds=1)
     last, history, races = planned[-1], list[Iteration](), list[Race]()
 
@@ -116,12 +119,15 @@ def _minimize(planner: Planner, planned: Sequence[StageResult], optimizer: Traje
 
 
 def _execute(planner: Planner, planned: Sequence[StageResult], plan: Tensor) -> list[StageResult] | None:
-    """Each stage executed with its new actions out of (K T, A); None where one leaves the finite numbers."""
+    """Each stage executed with its new rows and actions out of (K (rows + T), A); None where one leaves the finite numbers."""
+    placing = Placing(scene=planner.task.scene)
     state, loss, executed = planned[0].state_before, planned[0].loss_before, list[StageResult]()
-    for result, actions in zip(planned, plan.chunk(len(planned)), strict=True):
+    for result, part in zip(planned, plan.unsqueeze(0).chunk(len(planned), dim=1), strict=True):
         before = state
-        start = begin_stage(planner.task.scene, state, _executed(result).proposal.pose, actions.unsqueeze(0))
-        trajectory = planner.simulator.rollout(start, actions.unsqueeze(0))
+        rows, actions = placing.split(part)
+        poses = placing.placed(_executed(result).proposal.pose.to(rows).unsqueeze(0), rows)
+        start = begin_stage(planner.task.scene, state, poses, actions)
+        trajectory = planner.simulator.rollout(start, actions)
         if not is_finite(trajectory):
             return None
         evaluated = planner.objective.evaluate(trajectory)

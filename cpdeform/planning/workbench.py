@@ -19,7 +19,9 @@ from cpdeform.core.task import Task
 from cpdeform.planning.batches import Evaluator, evaluate_worlds
 from cpdeform.planning.executor import Executor, ExecutorSerial
 from cpdeform.planning.optimizer import Iteration, OptimizationResult, TrajectoryOptimizer
+from cpdeform.planning.placed import Placing, SimulatorPlaced
 from cpdeform.planning.race import Race
+from cpdeform.planning.stage_start import begin_stage
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -32,6 +34,7 @@ class Racing:
         candidates: Its candidates, one a world.
         race: The worlds; None before they start.
         first_loss: Loss of the first candidate's first actions; None before it is known.
+        placing: What the rows before the actions mean; None where there are none.
     """
 
     phase: str
@@ -39,6 +42,18 @@ class Racing:
     candidates: tuple[Candidate, ...]
     race: Race | None = None
     first_loss: float | None = None
+    placing: Placing | None = None
+
+    def plan(self, number: int, actions: Tensor) -> Candidate:
+        """A candidate with the plan that actions (rows + T, A) of its world are, tools placed by their rows."""
+        candidate = self.candidates[number]
+        if self.placing is None or self.race is None:
+            return dataclasses.replace(candidate, actions=actions)
+        state = self.race.state.map(lambda tensor: tensor[number : number + 1])
+        rows, rest = self.placing.split(actions.unsqueeze(0))
+        start = begin_stage(self.placing.scene, state, self.placing.placed(state.tool_pose, rows), rest)
+        proposal = dataclasses.replace(candidate.proposal, pose=start.tool_pose[0].to(candidate.proposal.pose))
+        return dataclasses.replace(candidate, proposal=proposal, actions=rest[0])
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -123,7 +138,13 @@ class Workbench:
         return self.stage.state.fork(len(candidates)).with_tools(poses)
 
     def minimize(
-        self, candidates: Sequence[Candidate], optimizer: TrajectoryOptimizer, objective: Objective | None, *, phase: str
+        self,
+        candidates: Sequence[Candidate],
+        optimizer: TrajectoryOptimizer,
+        objective: Objective | None,
+        *,
+        phase: str,
+        placing: Placing | None = None,
     ) -> OptimizationResult:
         """Minimise an objective over the actions of candidates, count what it took, and tell of each iteration.
 
@@ -132,10 +153,13 @@ class Workbench:
             optimizer: How.
             objective: The loss; None for the stage's own.
             phase: Name of the phase that asks.
+            placing: How far the tools may be placed anew; None leaves them where they are. With it the actions that come back begin
+                with its rows; `Racing.plan` makes plans of them.
         """
         self._announce(len(candidates))
         loss = self.objective if objective is None else objective
-        racing = self.racing = Racing(phase=phase, objective=loss, candidates=tuple(candidates))
+        racing = self.racing = Racing(phase=phase, objective=loss, candidates=tuple(candidates), placing=placing)
+        actions = torch.stack([candidate.actions for candidate in candidates])
         first = len(self.history)
 
         def begin(race: Race) -> None:
@@ -149,9 +173,9 @@ class Workbench:
 
         try:
             found = optimizer.minimize(
-                self.simulator,
+                self.simulator if placing is None else SimulatorPlaced(self.simulator, placing),
                 self.worlds(candidates),
-                torch.stack([candidate.actions for candidate in candidates]),
+                actions if placing is None else placing.before(actions),
                 loss,
                 rest_steps=self.task.rest_steps,
                 warm=self._warm(objective, len(candidates)),

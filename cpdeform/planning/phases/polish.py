@@ -13,6 +13,7 @@ from cpdeform.planning.effort import Effort
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.choice import best_of_each_kind, best_unlike
 from cpdeform.planning.phases.phase import Phase, Scope
+from cpdeform.planning.placed import Placing
 from cpdeform.planning.workbench import Workbench
 
 
@@ -25,6 +26,7 @@ class PhasePolish(Phase):
         optimizer: How.
         exclusive: Whether the others get an infinite loss: where their losses are estimates, no plan should be chosen by them.
         each_kind: Whether the kinds of candidates take turns, the best of each first.
+        placing: Whether the descent also places the tools anew; see `cpdeform.planning.placed`.
         name: The phase's name.
 
     Raises:
@@ -36,6 +38,7 @@ class PhasePolish(Phase):
     optimizer: TrajectoryOptimizer
     exclusive: bool = False
     each_kind: bool = False
+    placing: bool = False
     name: str = "polish"
 
     def __post_init__(self) -> None:
@@ -51,11 +54,14 @@ class PhasePolish(Phase):
         chosen = (best_of_each_kind if self.each_kind else best_unlike)(candidates, self.keep)
         if not chosen:
             return candidates
-        found = bench.minimize([candidates[number] for number in chosen], self.optimizer, None, phase=self.name)
+        some = [candidates[number] for number in chosen]
+        placing = Placing(scene=bench.task.scene) if self.placing else None
+        found = bench.minimize(some, self.optimizer, None, phase=self.name, placing=placing)
+        assert bench.racing is not None
         result = list(candidates)
         if self.exclusive:
             result = [dataclasses.replace(candidate, loss=torch.inf) for candidate in candidates]
-        for number, loss, actions in zip(chosen, found.loss.tolist(), found.actions, strict=True):
+        for place, (number, loss, actions) in enumerate(zip(chosen, found.loss.tolist(), found.actions, strict=True)):
             if loss < result[number].loss:
-                result[number] = dataclasses.replace(candidates[number], loss=loss, actions=actions)
+                result[number] = dataclasses.replace(bench.racing.plan(place, actions), loss=loss)
         return result

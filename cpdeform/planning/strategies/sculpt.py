@@ -50,12 +50,12 @@ class StrategySculpt(Strategy):
     """Each stage is one touch, the best of many; a few of them at a time are then polished together.
 
     A stage draws random touches, judges each by one rollout, varies the best, and polishes the best of all by gradients, in two
-    steps. The loss is transport and misplaced mass. The clay is let to rest before the first touch. Where no touch gains, others
-    are drawn, a few times in a row.
+    steps, over their actions and over where their tools begin (`cpdeform.planning.placed`). The loss is transport and misplaced
+    mass. The clay is let to rest before the first touch. Where no touch gains, others are drawn, a few times in a row.
 
     A touch that is planned alone serves its own loss. Once a few are found, one descent lowers the loss at their end over the
-    actions of all (`cpdeform.planning.joint`), as far as the simulator's gradients can be chained: these stages are then given once
-    more, revised.
+    actions and placements of all (`cpdeform.planning.joint`), as far as the simulator's gradients can be chained: these stages are
+    then given once more, revised.
 
     Args:
         touches: Random touches of a stage.
@@ -119,7 +119,7 @@ class StrategySculpt(Strategy):
         return (
             PhaseScreening(keep=SCREENED),
             *(
-                PhasePolish(keep=keep, optimizer=optimizer, exclusive=number == 0, each_kind=number == 0)
+                PhasePolish(keep=keep, optimizer=optimizer, exclusive=number == 0, each_kind=number == 0, placing=True)
                 for number, (keep, optimizer) in enumerate(optimizers)
             ),
         )
