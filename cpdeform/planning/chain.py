@@ -21,8 +21,8 @@ class SimulatorChain(Simulator):
     """A simulator whose rollout is a row of stages: between them the tools are lifted off and put to the next stage's poses.
 
     The clay goes on as the stage before left it. A tool that would begin a stage inside it, since the stages before have changed,
-    is first moved out by the shortest way (`cpdeform.planning.stage_start`). The gradient takes that way as fixed. It takes the poses
-    as fixed, too, but for what rows of actions at the start of each stage make of them, if `placing` is given.
+    is first moved out by the shortest way (`cpdeform.planning.stage_start`). The gradient takes that way as fixed, and the poses,
+    too, but for what rows of actions at the start of each stage make of them, if `placing` is given.
 
     Args:
         simulator: Computes the stages; its `vjp` has to take `grad_final_state`.
