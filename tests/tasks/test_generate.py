@@ -139,6 +139,9 @@ def test_variations_of_scripts_are_motions_of_the_scene(name):
     assert rows[0].shape[1] == scene.action_size
     assert torch.equal(rows[0], rows[1])
     assert rows[0].shape != rows[2].shape or not torch.equal(rows[0], rows[2])
+    for seed in range(200):
+        for leg in script_motion(scene, name, np.random.default_rng(seed)):
+            assert float(leg.action_rows(scene).abs().max()) <= 1.0
 
 
 @pytest.mark.parametrize(("name", "seed"), [("star", 1), ("move++", 0)])

@@ -5,6 +5,7 @@ What they leave is within reach by construction: the tools have made it.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -152,7 +153,17 @@ def script_motion(scene: Scene, name: str, rng: np.random.Generator) -> list[Leg
         rng: Where random numbers come from.
     """
     script, variants = SCRIPTS[name]
-    return script(scene, *_between(variants, rng))
+    return [_feasible(leg) for leg in script(scene, *_between(variants, rng))]
+
+
+def _feasible(leg: Leg) -> Leg:
+    """A leg of the same way with actions in [-1, 1]: a long way that was drawn with few steps takes more of them."""
+    fastest = max((abs(value) for action in leg.actions.values() for value in action), default=0.0)
+    if fastest <= 1.0:
+        return leg
+    steps = math.ceil(leg.steps * fastest)
+    actions = {index: [value * leg.steps / steps for value in action] for index, action in leg.actions.items()}
+    return dataclasses.replace(leg, steps=steps, actions=actions)
 
 
 def _between(variants: Sequence[Any], rng: np.random.Generator) -> Any:
