@@ -21,6 +21,7 @@ from cpdeform.experiments.studies.equal_cost import budget_values, known_shares,
 from cpdeform.experiments.studies.statistics import Interval, mean, rank_correlation
 from cpdeform.experiments.studies.study import PRESETS, STUDIES
 from cpdeform.experiments.studies.trace import learning_curve, stage_points, value_at
+from cpdeform.planning.strategies.sculpt import StrategySculpt
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record import load_record
 
@@ -90,7 +91,7 @@ def test_presets_stay_below_what_a_task_asks_for():
     assert all(study.methods[0] == "cpdeform" for study in STUDIES.values())
 
 
-@pytest.mark.parametrize("method", ["fixed", "random", "restarts", "bayesopt", "cma", "mppi", "sampled-gradients"])
+@pytest.mark.parametrize("method", ["fixed", "random", "restarts", "bayesopt", "cma", "mppi", "sculpt", "sampled-gradients"])
 @pytest.mark.parametrize(("cost", "share"), [(24.0, 0.2), (90.0, 0.25), (7.5, 0.5)])
 def test_every_method_is_sized_for_the_budget(method, cost, share):
     found = budget_values(method, cost, share=share, iterations=8)
@@ -104,6 +105,11 @@ def test_every_method_is_sized_for_the_budget(method, cost, share):
         rollouts = options["population"] * options["generations"]
     elif method == "mppi":
         rollouts = options["samples"] * (options["updates"] + 1)
+    elif method == "sculpt":
+        assert StrategySculpt(**options).together == 1
+        rollouts = options["touches"] + 2 * options["variations"]
+        gradients = sum(math.prod(step) for step in zip(options["polished"], options["iterations"], strict=True))
+        gradients += options["joint_iterations"]
     else:
         gradients, rollouts = optimizer["iterations"] * options["keep"], options["samples"]
     assert gradients + share * rollouts == pytest.approx(cost, rel=0.35)

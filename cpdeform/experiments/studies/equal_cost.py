@@ -24,6 +24,13 @@ SHARES = "rollout-shares"
 POPULATION, SAMPLES, KEPT = 16, 32, 3
 """Plans of a generation of `cma`, samples of a round of `mppi`, descents of `sampled-gradients`."""
 
+TOUCHES, VARIATIONS, POLISHED, ROW = 96, 32, (10, 2), (4, 8)
+"""What a stage of `sculpt` draws, varies in each of two rounds and polishes in two steps, and the gradients of each of these, at
+full size."""
+
+JOINT_SHARE = 0.25
+"""Part of a stage's cost that `sculpt` spends in a descent over the touch that it has found."""
+
 REPEATS = 5
 
 
@@ -118,6 +125,8 @@ def budget_values(method: str, cost: float, *, share: float, iterations: int) ->
     if method == "mppi":
         samples = min(SAMPLES, max(2, rollouts // 2))
         return {"strategy_options": {"samples": samples, "updates": max(1, round(rollouts / samples) - 1)}}
+    if method == "sculpt":
+        return {"strategy_options": _touches(cost, share=share)}
     if method == "sampled-gradients":
         kept = min(KEPT, max(1, whole // 2))
         descent = max(1, round(0.5 * cost / kept))
@@ -127,3 +136,24 @@ def budget_values(method: str, cost: float, *, share: float, iterations: int) ->
             "strategy_options": {"samples": samples, "keep": kept},
         }
     return {}
+
+
+def _touches(cost: float, *, share: float) -> dict[str, Any]:
+    """Options of `sculpt`: fewer touches and fewer of them polished, each stage by itself."""
+    joint = max(1, round(JOINT_SHARE * cost))
+    part = (cost - joint) / (
+        share * (TOUCHES + 2 * VARIATIONS) + sum(count * row for count, row in zip(POLISHED, ROW, strict=True))
+    )
+    polished = tuple(max(1, round(part * count)) for count in POLISHED)
+    # One candidate may be more than the part of a step; its gradients then make up for it.
+    rows = tuple(max(1, round(part * count * row / kept)) for count, row, kept in zip(POLISHED, ROW, polished, strict=True))
+    sizes = {"touches": TOUCHES, "variations": VARIATIONS}
+    found: dict[str, Any] = {name: max(2, round(part * size)) for name, size in sizes.items()}
+    return {
+        **found,
+        "polished": polished,
+        "iterations": rows,
+        "together": 1,
+        "joint_iterations": joint,
+        "interim_iterations": joint,
+    }

@@ -43,7 +43,7 @@ STUDIES: Mapping[str, Study] = MappingProxyType(
         ),
         RIVALS: Study(
             title="All methods at equal cost",
-            methods=("cpdeform", "fixed", "random", "restarts", "bayesopt", "cma", "mppi", "sampled-gradients"),
+            methods=("cpdeform", "sculpt", "fixed", "random", "restarts", "bayesopt", "cma", "mppi", "sampled-gradients"),
             equal_cost=True,
         ),
     }
