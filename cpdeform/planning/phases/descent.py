@@ -12,7 +12,6 @@ from cpdeform.core.placer import Candidate
 from cpdeform.planning.effort import Effort
 from cpdeform.planning.optimizer import SEARCH, TrajectoryOptimizer
 from cpdeform.planning.phases.phase import Phase, Scope
-from cpdeform.planning.placed import Placing
 from cpdeform.planning.workbench import Workbench
 
 REFINEMENT = "refinement"
@@ -32,7 +31,6 @@ class PhaseDescent(Phase):
     scope: ClassVar[Scope] = "round"
     optimizer: TrajectoryOptimizer
     objective: Objective | None = None
-    placing: bool = False
     name: str = SEARCH
 
     def effort(self, candidates: int) -> Effort:
@@ -45,14 +43,10 @@ class PhaseDescent(Phase):
         running = [number for number, candidate in enumerate(candidates) if candidate.loss != torch.inf]
         if not running:
             return candidates
-        some = [candidates[number] for number in running]
-        placing = Placing(scene=bench.task.scene) if self.placing else None
-        found = bench.minimize(some, self.optimizer, self.objective, phase=self.name, placing=placing)
-        assert bench.racing is not None
+        found = bench.minimize([candidates[number] for number in running], self.optimizer, self.objective, phase=self.name)
         result = list(candidates)
-        rows = enumerate(zip(running, found.loss.tolist(), found.actions, found.finite.tolist(), strict=True))
-        for place, (number, loss, actions, finite) in rows:
-            result[number] = dataclasses.replace(bench.racing.plan(place, actions), loss=loss, finite=finite)
+        for number, loss, actions, finite in zip(running, found.loss.tolist(), found.actions, found.finite.tolist(), strict=True):
+            result[number] = dataclasses.replace(candidates[number], loss=loss, actions=actions, finite=finite)
         return result
 
 
