@@ -32,6 +32,7 @@ CAMERAS = {
 """Tasks of the pictures of sculpted shapes, and where they are looked at from."""
 SCULPTED = {"sculpted": ("star", "airplane", "bottle", "chair"), "sculpted-2": ("rope++", "move++", "pinch")}
 """Pictures and their rows: that of the README, and what the results page shows beside it."""
+TOUCHES_SHOWN = 3
 ENDED = ("finished", "no_improvement")
 """States of runs that need not be made again: in the second one the last stage found nothing more."""
 SHOWN = "#stage=12&step=10&colour=height&goal=1"
@@ -45,12 +46,12 @@ def draw_writer() -> None:
 
 
 def draw_sculpted(picture: str) -> None:
-    """A row a run: the start, the first touch with its tools, half of the touches, the result, and the goal."""
+    """A row a run: three touches with priorities and tools, the first of them on the start, the result, and the goal."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from torch import cat
 
-    from cpdeform.report.pictures import draw_panel, make_view
+    from cpdeform.report.pictures import draw_panel, draw_priorities, make_view
     from cpdeform.run.record_reader import load_record
 
     tasks = SCULPTED[picture]
@@ -59,22 +60,19 @@ def draw_sculpted(picture: str) -> None:
         record = load_record(run(task))
         view = make_view(record, camera=CAMERAS[task])
         stages = [stage for stage in record.stages if stage.status.executed]
-        first, half, last = stages[0], stages[len(stages) // 2 - 1], stages[-1]
-        clouds = [
-            first.state_before.position[0],
-            first.state.position[0],
-            half.state.position[0],
-            last.state.position[0],
-            record.goal,
-        ]
-        titles = (f"{task}: start", "first touch", f"after {len(stages) // 2}", f"after {len(stages)} touches", "goal")
-        for axis, title, cloud in zip(axes, titles, clouds, strict=True):
-            draw_panel(axis, view, record, title, cloud.double(), first.tool_poses[-1] if title == "first touch" else None)
+        shown = [stages[number * len(stages) // TOUCHES_SHOWN] for number in range(TOUCHES_SHOWN)]
+        for axis, stage in zip(axes, shown, strict=False):
+            draw_priorities(figure, axis, view, record, stage, stage.tool_poses[0], bar=False)
+            axis.set_title(f"{task}: touch {stage.index + 1}" if stage is shown[0] else f"touch {stage.index + 1}", fontsize=11)
+        start, result = stages[0].state_before.position[0], stages[-1].state.position[0]
+        for axis, title, cloud in zip(axes[-2:], (f"after {len(stages)} touches", "goal"), (result, record.goal), strict=True):
+            draw_panel(axis, view, record, title, cloud.double(), None)
+        seen = view.camera.project(cat([start, record.goal]).double().numpy())
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        margin = 0.25 * max(high[:2] - low[:2])
+        for axis in axes:
             for arrow in list(axis.texts):
                 arrow.remove()
-            shown = view.camera.project(cat([clouds[0], clouds[-1]]).double().numpy())
-            low, high = shown.min(axis=0), shown.max(axis=0)
-            margin = 0.25 * max(high[:2] - low[:2])
             axis.set_xlim(low[0] - margin, high[0] + margin)
             axis.set_ylim(low[1] - margin, high[1] + margin)
     drawn = io.BytesIO()

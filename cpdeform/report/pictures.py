@@ -193,8 +193,10 @@ def draw_panel(axis: Any, view: View, record: RunRecord, title: str, position: A
     axis.set_title(title, fontsize=11)
 
 
-def draw_priorities(figure: Any, axis: Any, view: View, record: RunRecord, stage: StageResult, pose: Any) -> None:
-    """Panel of the transport priorities with the tools as placed."""
+def draw_priorities(
+    figure: Any, axis: Any, view: View, record: RunRecord, stage: StageResult, pose: Any, *, bar: bool = True
+) -> None:
+    """Panel of the transport priorities with the tools as placed; the colour bar may be left out."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -208,10 +210,10 @@ def draw_priorities(figure: Any, axis: Any, view: View, record: RunRecord, stage
     where = f" of stage {stage.index + 1}" if len(record.stages) > 1 else ""
     placed = "tool placed" if stage.best is not None else "no tool placed"
     axis.set_title(f"priorities{where}, {placed}" if known else f"{placed}{where} (the placer needs no priorities)", fontsize=11)
-    if known:
-        bar = figure.colorbar(mappable, ax=axis, location="bottom", shrink=0.7, aspect=32, pad=0.02)
-        bar.set_label("transport priority (length)", fontsize=8)
-        bar.ax.tick_params(labelsize=7)
+    if known and bar:
+        drawn = figure.colorbar(mappable, ax=axis, location="bottom", shrink=0.7, aspect=32, pad=0.02)
+        drawn.set_label("transport priority (length)", fontsize=8)
+        drawn.ax.tick_params(labelsize=7)
 
 
 def _add_height_bar(figure: Any, axes: NDArray[Any], view: View) -> None:
