@@ -107,6 +107,7 @@ class Planner:
     phases: Sequence[Phase]
     problem: TransportProblem | None = None
     loop: Callable[[Planner, Start], Iterator[StageResult | Revision]] | None = None
+    outlasts_rest: bool = False
     executor: Executor = dataclasses.field(default_factory=ExecutorSerial)
     seed: int = 0
     observers: tuple[Observer, ...] = ()
@@ -229,7 +230,7 @@ class Planner:
         """Execute the best candidate of a stage, and let further phases work on it."""
         # "execute the plan with the lowest loss"
         best = min(range(len(candidates)), key=lambda number: candidates[number].loss, default=None)
-        status = _search_status(candidates, best, bench.stage.loss)
+        status = _search_status(candidates, best, bench.loss_to_beat)
         if best is not None and status is Status.FINISHED:
             self.tell_part(bench.stage.index, "execution")
             status = self._execute(bench, self._phases("round", "search")[-1], candidates[best], execution)
@@ -304,6 +305,8 @@ class Planner:
         wanted = self.placer.transport_problem is not None
         transport = self.ot_solver.solve(state.position[0], start.goal) if wanted else None
         bench.stage, bench.warm = dataclasses.replace(stage, transport=transport, loss=float(begin.loss[0])), begin.warm
+        if self.outlasts_rest:
+            bench.measure_rest()
         bench.lap("transport")
         return bench
 
@@ -332,7 +335,7 @@ class Planner:
         if not np.isfinite(loss):
             return Status.NON_FINITE
         # A warm-started loss may flatter its plan, and sums in another order may make a rollout at the brink break.
-        if not phase.accepts(loss, loss_before=bench.stage.loss, loss_now=execution.loss):
+        if not phase.accepts(loss, loss_before=bench.loss_to_beat, loss_now=execution.loss):
             return Status.NO_IMPROVEMENT
         execution.trajectory, execution.loss, execution.warm = trajectory, loss, warm
         if phase.scope == "plan":

@@ -73,7 +73,7 @@ def best_so_far(
     """
     candidates = _candidates(bench, searching=execution.trajectory is None)
     best = min(range(len(candidates)), key=lambda number: candidates[number].loss, default=None)
-    if best is None or not candidates[best].loss < bench.stage.loss:
+    if best is None or not candidates[best].loss < bench.loss_to_beat:
         return None
     bench.lap("optimization" if execution.trajectory is None else "refinement")
     # The interruption goes on whatever happens here: a simulator may not be able to compute after it, for example.

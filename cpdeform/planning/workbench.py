@@ -73,6 +73,7 @@ class Workbench:
         rollouts: Rollouts without a gradient so far.
         history: Every iteration so far, in order.
         candidates: The candidates of all rounds that are over.
+        rest_loss: Loss after leaving the clay alone for as long as a plan takes; None where it does not count.
         racing: The descent that runs, or ran last; None once its candidates are kept.
         seconds: Wall time by part.
     """
@@ -89,6 +90,7 @@ class Workbench:
     rollouts: int = 0
     history: list[Iteration] = dataclasses.field(default_factory=list)
     candidates: list[Candidate] = dataclasses.field(default_factory=list)
+    rest_loss: float | None = None
     racing: Racing | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
 
@@ -100,6 +102,19 @@ class Workbench:
         now = time.perf_counter()
         self.seconds[name] = self.seconds.get(name, 0.0) + now - self._mark
         self._mark = now
+
+    @property
+    def loss_to_beat(self) -> float:
+        """The loss that a plan has to be below: that of the stage's state, or of what it becomes if it is left alone."""
+        return self.stage.loss if self.rest_loss is None else self.rest_loss
+
+    def measure_rest(self) -> None:
+        """Leave the clay alone for as long as a plan takes, and let plans be compared with what comes of that."""
+        state, shape = self.stage.state, (1, self.task.rollout_steps, self.task.scene.action_size)
+        trajectory = self.simulator.simulate(state, state.position.new_zeros(shape))
+        self.rollouts += 1
+        if is_finite(trajectory):
+            self.rest_loss = float(self.objective.losses(trajectory, self.warm)[0])
 
     def keep(self, candidates: Sequence[Candidate]) -> None:
         """Keep the candidates of a round that is over."""

@@ -85,8 +85,8 @@ def test_touches_are_screened_coarsely_and_executed_with_all_particles(task):
     (stage,) = result.stages
     assert stage.status is Status.FINISHED
     thin = sum(worlds for worlds, particles in Counting.seen if particles == 901)
-    # Six touches and two rounds of three, all with half of the particles; the execution is the one rollout with all.
-    assert (thin, stage.rollouts) == (len(stage.candidates), len(stage.candidates) + 1)
+    # Six touches and two rounds of three, all with half of the particles; with all are the execution and the clay left alone.
+    assert (thin, stage.rollouts) == (len(stage.candidates), len(stage.candidates) + 2)
     assert stage.positions.shape[1] == 1801
     # Only plans that were polished with all particles are in the race.
     assert sum(np.isfinite(candidate.loss) for candidate in stage.candidates) <= 2

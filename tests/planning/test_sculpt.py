@@ -91,8 +91,8 @@ def test_a_run_by_touches(task):
     first = result.stages[0]
     assert first.status is Status.FINISHED
     assert result.loss_final < 0.6 * result.loss_initial
-    # Every candidate by a rollout, ten and then two of them by gradients, and the execution.
-    assert first.rollouts == len(first.candidates) + 1
+    # Every candidate by a rollout, ten and then two of them by gradients, the clay left alone, and the execution.
+    assert first.rollouts == len(first.candidates) + 2
     assert first.gradient_evaluations <= 10 * 2 + 2 * 2
     assert {iteration.phase for iteration in first.history} == {"polish"}
     assert {"touch"} == {result.configuration.placer}

@@ -15,7 +15,7 @@ from cpdeform.core.simulator import Simulator
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
 from cpdeform.planning.coarse import CoarseModel
-from cpdeform.planning.effort import JointEffort
+from cpdeform.planning.effort import Effort, JointEffort
 from cpdeform.planning.interrupted import StageInterrupted, StagesInterrupted
 from cpdeform.planning.joint import PHASE as JOINT_POLISH
 from cpdeform.planning.joint import polish_jointly
@@ -123,6 +123,10 @@ class StrategySculpt(Strategy):
                 for number, (keep, optimizer) in enumerate(optimizers)
             ),
         )
+
+    def effort(self, stage: Effort) -> Effort:
+        """See `Strategy`; each stage leaves the clay alone once, to see what its plan has to be better than."""
+        return stage + Effort(rollouts=(1, 1))
 
     def joint_efforts(self, simulator: Simulator, *, stages: int) -> tuple[JointEffort, ...]:
         """See `Strategy`; each goes over all stages found since the last chapter."""
@@ -245,7 +249,7 @@ def from_rest(planner: Planner, start: Start) -> tuple[Planner, Start]:
     if isinstance(objective, ObjectiveShape):
         objective = objective.rebased(goal=goal, start=first.position[0])
     state = start.state if start.previous or start.first_stage else first
-    return dataclasses.replace(planner, objective=objective), dataclasses.replace(start, state=state, goal=goal)
+    return dataclasses.replace(planner, objective=objective, outlasts_rest=True), dataclasses.replace(start, state=state, goal=goal)
 
 
 def _settled(simulator: Simulator, goal: Tensor) -> Tensor:
