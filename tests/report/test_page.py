@@ -207,3 +207,15 @@ def test_the_browser_reads_what_python_wrote_and_what_the_address_says(browser, 
     order = spatial_order(record.stages[0].state_before.position[0].double().numpy())
     wanted = record.stages[0].positions.double().numpy()[:, order]
     assert np.abs(np.array(found).reshape(wanted.shape) / 65535 - wanted).max() <= 0.51 / 65535
+
+
+def test_the_page_follows_a_changed_address(browser, page):
+    opened(browser, page, "#stage=1&goal=1")
+    browser.ask("void (location.hash = '#stage=2&step=3&colour=error')")
+    browser.wait_for("cpdeform.player.stage === 1 && cpdeform.player.time === 3 && cpdeform.player.colour === 'error'")
+    # What the address does not name stays as it is.
+    assert browser.ask("cpdeform.player.showGoal") is True
+    browser.ask("void (location.hash = '#goal=0')")
+    browser.wait_for("!cpdeform.player.showGoal")
+    assert browser.ask("[cpdeform.player.stage, cpdeform.player.time]") == [1, 3]
+    assert browser.complaints() == []

@@ -6,7 +6,8 @@ const COLOURS = ["height", "priority", "error"];
 function readAddress() {
   const values = new URLSearchParams(location.hash.slice(1));
   const number = (name) => (values.has(name) ? Number(values.get(name)) : null);
-  return { stage: number("stage"), step: number("step"), colour: values.get("colour"), goal: values.get("goal") === "1", play: values.get("play") === "1", view: values.get("view") };
+  const flag = (name) => (values.has(name) ? values.get(name) === "1" : null);
+  return { stage: number("stage"), step: number("step"), colour: values.get("colour"), goal: flag("goal"), play: flag("play"), view: values.get("view") };
 }
 
 function button(text, press, attributes = {}) { return element("button", { type: "button", click: press, ...attributes }, text); }
@@ -94,6 +95,20 @@ async function follow(player) {
   }
 }
 
+/** Shows what the address asks for; what it does not name stays as it is. */
+async function obey(player) {
+  const asked = readAddress();
+  if (asked.view in VIEWS) player.view.look(...VIEWS[asked.view]);
+  if (COLOURS.includes(asked.colour)) player.setColour(asked.colour);
+  if (asked.stage !== null || asked.step !== null) {
+    const first = player.content.stages[0].index + 1;
+    await player.goTo(asked.stage === null ? player.stage : asked.stage - first, asked.step ?? 0);
+  } else await player.show();
+  if (asked.goal !== null) player.setGoal(asked.goal);
+  if (asked.play !== null) player.play(asked.play);
+  player.changed();
+}
+
 async function start() {
   let content = await loadContent();
   drawAll(content);
@@ -119,9 +134,10 @@ async function start() {
   const loop = async (now) => { await player.tick(now); requestAnimationFrame(loop); };
   requestAnimationFrame(loop);
   await view.loadGoal();
-  player.setGoal(asked.goal);
+  player.setGoal(asked.goal === true);
   player.changed();
   if (asked.play) player.play(true);
+  window.addEventListener("hashchange", () => obey(player));
   window.cpdeform = { player, view };
   document.documentElement.dataset.ready = "true";
   while (LIVE) {
