@@ -67,7 +67,7 @@ class StrategySculpt(Strategy):
         joint_every: Stages after which those found so far are polished together on the way.
         interim_iterations: Gradient evaluations of each of them in that.
         coarse: Whether touches are screened with fewer particles, where there are many; see `cpdeform.planning.coarse`.
-        idle: Stages without a gain in a row after which the run ends.
+        idle: Stages without a gain in a row after which the run ends, unless the joint descent that follows gains.
 
     Raises:
         InputError: An option is out of range.
@@ -149,14 +149,17 @@ class StrategySculpt(Strategy):
             planner = screened_coarsely(planner)
         finished: list[StageResult] = []
         end = start.first_stage + start.stages
+        # Of the stages before the last joint descent that brought a gain it no longer counts that they had none.
+        counted = 0
         for stages in _parts(range(start.first_stage, end), self.together):
             held: list[StageResult] = []
-            for part in _parts(stages, self.joint_every):
-                for result in self._touches(planner, start, part, [*finished, *held]):
+            while len(held) < len(stages):
+                for result in self._touches(planner, start, self._next(stages, len(held)), [*finished, *held], counted):
                     held.append(result)
                     yield result
-                over = self._is_over([*finished, *held])
-                last = over or part[-1] == stages[-1]
+                over = self._is_over([*finished, *held], counted)
+                last = over or len(held) == len(stages)
+                first = held[-1].loss
                 for _ in range(self._rounds(_planned(held)) if last else 1):
                     before = held[-1].loss
                     for revision in self._polished(planner, held, self._joint if last else self._interim):
@@ -164,9 +167,15 @@ class StrategySculpt(Strategy):
                         yield revision
                     if before - held[-1].loss < WORTH_ANOTHER * before:
                         break
-                if over:
+                if over and (held[-1].status is Status.NON_FINITE or first - held[-1].loss < WORTH_ANOTHER * first):
                     return
+                if over:
+                    counted = len(finished) + len(held)
             finished += held
+
+    def _next(self, stages: range, done: int) -> range:
+        """The stages up to the next joint descent."""
+        return stages[done : (done // self.joint_every + 1) * self.joint_every]
 
     def _rounds(self, planned: int) -> int:
         """The most joint descents at the end of a row, by its stages with a plan: few may have as many gradients as many."""
@@ -184,7 +193,9 @@ class StrategySculpt(Strategy):
             yield Revision(interruption.results, JOINT_POLISH)
             raise
 
-    def _touches(self, planner: Planner, start: Start, stages: range, finished: Sequence[StageResult]) -> Iterator[StageResult]:
+    def _touches(
+        self, planner: Planner, start: Start, stages: range, finished: Sequence[StageResult], counted: int
+    ) -> Iterator[StageResult]:
         """Stages one after the other, each by itself; an interrupted one, too, before the interruption goes on."""
         before = list(finished)
         for index in stages:
@@ -195,12 +206,12 @@ class StrategySculpt(Strategy):
                 yield interruption.result
                 raise
             yield before[-1]
-            if self._is_over(before):
+            if self._is_over(before, counted):
                 return
 
-    def _is_over(self, results: Sequence[StageResult]) -> bool:
-        """Whether the last stages gained nothing, or the last one broke."""
-        last = results[-self.idle :]
+    def _is_over(self, results: Sequence[StageResult], counted: int) -> bool:
+        """Whether the last stages, from number `counted` on, gained nothing, or the last one broke."""
+        last = results[counted:][-self.idle :]
         stuck = len(last) == self.idle and all(result.status is not Status.FINISHED for result in last)
         return stuck or results[-1].status is Status.NON_FINITE
 
