@@ -7,6 +7,8 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
+from torch import Tensor
+
 from cpdeform.core.objective import Objective
 from cpdeform.core.placer import Placer
 from cpdeform.core.simulator import Simulator
@@ -91,6 +93,16 @@ class Strategy(abc.ABC):
             stage: What the phases cost.
         """
         return stage
+
+    def objective(self, objective: Objective, *, simulator: Simulator, goal: Tensor) -> Objective:
+        """The loss that the loop measures stages by, for those who look at a record; defaults to the one of the configuration.
+
+        Args:
+            objective: That one.
+            simulator: Physics.
+            goal: Goal particles (M, 3), length units.
+        """
+        return objective
 
     def joint_efforts(self, simulator: Simulator, *, stages: int) -> tuple[JointEffort, ...]:
         """What the loop computes between stages over several of them together, for the estimate; defaults to nothing.

@@ -11,7 +11,9 @@ from torch import Tensor
 
 from cpdeform.core.errors import InputError
 from cpdeform.core.final_gradient import takes_final_gradient
+from cpdeform.core.objective import Objective
 from cpdeform.core.simulator import Simulator
+from cpdeform.core.state import State
 from cpdeform.core.task import Task
 from cpdeform.planning.algorithm import Planner, Start
 from cpdeform.planning.coarse import CoarseModel
@@ -127,6 +129,11 @@ class StrategySculpt(Strategy):
     def effort(self, stage: Effort) -> Effort:
         """See `Strategy`; each stage leaves the clay alone once, to see what its plan has to be better than."""
         return stage + Effort(rollouts=(1, 1))
+
+    def objective(self, objective: Objective, *, simulator: Simulator, goal: Tensor) -> Objective:
+        """See `Strategy`; it measures from rest to rest."""
+        first = rest(simulator, simulator.initial_state(batch_size=1)).state
+        return _from_rest(objective, first, _settled(simulator, goal))
 
     def joint_efforts(self, simulator: Simulator, *, stages: int) -> tuple[JointEffort, ...]:
         """See `Strategy`; each goes over all stages found since the last chapter."""
@@ -256,11 +263,14 @@ def from_rest(planner: Planner, start: Start) -> tuple[Planner, Start]:
     simulator = planner.simulator
     first = rest(simulator, simulator.initial_state(batch_size=1)).state
     goal = _settled(simulator, start.goal)
-    objective = planner.objective
-    if isinstance(objective, ObjectiveShape):
-        objective = objective.rebased(goal=goal, start=first.position[0])
+    objective = _from_rest(planner.objective, first, goal)
     state = start.state if start.previous or start.first_stage else first
     return dataclasses.replace(planner, objective=objective, outlasts_rest=True), dataclasses.replace(start, state=state, goal=goal)
+
+
+def _from_rest(objective: Objective, first: State, goal: Tensor) -> Objective:
+    """The loss from a start at rest, a single world, to a goal (M, 3) at rest."""
+    return objective.rebased(goal=goal, start=first.position[0]) if isinstance(objective, ObjectiveShape) else objective
 
 
 def _settled(simulator: Simulator, goal: Tensor) -> Tensor:
