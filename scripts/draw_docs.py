@@ -33,6 +33,7 @@ CAMERAS = {
 SCULPTED = {"sculpted": ("star", "airplane", "bottle", "chair"), "sculpted-2": ("rope++", "move++", "pinch")}
 """Pictures and their rows: that of the README, and what the results page shows beside it."""
 TOUCHES_SHOWN = 3
+"""Touches of a run in such a picture, from its first one on."""
 ENDED = ("finished", "no_improvement")
 """States of runs that need not be made again: in the second one the last stage found nothing more."""
 SHOWN = "#stage=11&step=10&colour=height&goal=1&view=top"

@@ -68,6 +68,8 @@ class Planner:
         objective: The shape loss, by which plans are chosen.
         phases: The steps from proposals to a stage's plan; see `cpdeform.planning.phases.phase.Phase`.
         loop: Leads from stage to stage; defaults to Algorithm 1's, `contact_points_discovery`.
+        compared_with_rest: Whether a plan has to be better than leaving the clay alone for as long, instead of better than the clay
+            as it is: where it still springs back from the stage before, part of what a plan loses or gains is not the plan's.
         executor: Where batches of worlds are computed.
         seed: Seed of first actions and random placements.
         observers: Told of every iteration and stage.
@@ -107,7 +109,7 @@ class Planner:
     phases: Sequence[Phase]
     problem: TransportProblem | None = None
     loop: Callable[[Planner, Start], Iterator[StageResult | Revision]] | None = None
-    outlasts_rest: bool = False
+    compared_with_rest: bool = False
     executor: Executor = dataclasses.field(default_factory=ExecutorSerial)
     seed: int = 0
     observers: tuple[Observer, ...] = ()
@@ -305,7 +307,7 @@ class Planner:
         wanted = self.placer.transport_problem is not None
         transport = self.ot_solver.solve(state.position[0], start.goal) if wanted else None
         bench.stage, bench.warm = dataclasses.replace(stage, transport=transport, loss=float(begin.loss[0])), begin.warm
-        if self.outlasts_rest:
+        if self.compared_with_rest:
             bench.measure_rest()
         bench.lap("transport")
         return bench

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from cpdeform.core.errors import CapabilityError, InputError
 from cpdeform.core.final_gradient import takes_final_gradient
-from cpdeform.core.shapes.kinds import TOOLS
-from cpdeform.core.simulator import RolloutGradient, Simulator, SimulatorCapabilities, Trajectory
+from cpdeform.core.simulator import RolloutGradient, Simulator, Trajectory
 from cpdeform.core.state import State
 from cpdeform.planning.placed import Placing, SimulatorPlaced
+from cpdeform.planning.wrapped import SimulatorWrapped
 
 
-class SimulatorChain(Simulator):
+class SimulatorChain(SimulatorWrapped):
     """A simulator whose rollout is a row of stages: between them the tools are lifted off and put to the next stage's poses.
 
     The clay goes on as the stage before left it. A tool that would begin a stage inside it, since the stages before have changed,
@@ -35,14 +34,6 @@ class SimulatorChain(Simulator):
         InputError: There is no stage.
     """
 
-    capabilities: ClassVar[SimulatorCapabilities] = SimulatorCapabilities(
-        differentiable=True,
-        devices=("cpu", "cuda"),
-        dtypes=(torch.float32, torch.float64),
-        tool_kinds=tuple(TOOLS),
-        deterministic_devices=(),
-    )
-
     def __init__(self, simulator: Simulator, *, poses: Tensor, rest_steps: int = 0, placing: Placing | None = None) -> None:
         if not len(poses):
             raise InputError("poses", came="no stage", expected="at least one stage")
@@ -51,7 +42,7 @@ class SimulatorChain(Simulator):
                 f"{type(simulator).__name__} cannot polish several stages together: its vjp takes no grad_final_state. "
                 "Choose another backend, or add the argument (see Simulator.vjp)."
             )
-        super().__init__(simulator.scene, batch_size=simulator.batch_size, device=simulator.device, dtype=simulator.dtype)
+        super().__init__(simulator)
         self._poses, self._rest_steps = poses.to(simulator.device, simulator.dtype), rest_steps
         self._stage = SimulatorPlaced(simulator, placing)
 
@@ -103,10 +94,6 @@ class SimulatorChain(Simulator):
         """Bytes of all stages together; `step_count` is that of the whole row."""
         each = step_count // len(self._poses)
         return len(self._poses) * self._stage.memory_estimate(each, worlds=worlds)
-
-    def release_memory(self) -> None:
-        """See `Simulator`."""
-        self._stage.release_memory()
 
     def _split(self, actions: Tensor) -> tuple[Tensor, ...]:
         if actions.shape[1] % len(self._poses):

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from cpdeform.core.rotation import from_rotation_vector, multiply
 from cpdeform.core.scene import Scene
-from cpdeform.core.shapes.kinds import TOOLS
-from cpdeform.core.simulator import RolloutGradient, Simulator, SimulatorCapabilities, Trajectory
+from cpdeform.core.simulator import RolloutGradient, Simulator, Trajectory
 from cpdeform.core.state import State
 from cpdeform.planning.stage_start import begin_stage
+from cpdeform.planning.wrapped import SimulatorWrapped
 
 LENGTH, ANGLE = 0.01, 0.1
 """How far an action of 1 moves a tool's place (length units) and turns it (radians): about what an action does to it in a step."""
@@ -76,7 +75,7 @@ class Placing:
         return [index for index, tool in enumerate(self.scene.tools) if tool.movable]
 
 
-class SimulatorPlaced(Simulator):
+class SimulatorPlaced(SimulatorWrapped):
     """A simulator whose first rows of actions place the tools; it takes no time, and the clay stays as it is.
 
     A tool that would then be inside the clay is moved out of it (`cpdeform.planning.stage_start`); the gradient takes that way as
@@ -87,17 +86,9 @@ class SimulatorPlaced(Simulator):
         placing: What the rows mean; None for no rows.
     """
 
-    capabilities: ClassVar[SimulatorCapabilities] = SimulatorCapabilities(
-        differentiable=True,
-        devices=("cpu", "cuda"),
-        dtypes=(torch.float32, torch.float64),
-        tool_kinds=tuple(TOOLS),
-        deterministic_devices=(),
-    )
-
     def __init__(self, simulator: Simulator, placing: Placing | None) -> None:
-        super().__init__(simulator.scene, batch_size=simulator.batch_size, device=simulator.device, dtype=simulator.dtype)
-        self._simulator, self._placing = simulator, placing
+        super().__init__(simulator)
+        self._placing = placing
 
     @property
     def rows(self) -> int:
@@ -133,7 +124,3 @@ class SimulatorPlaced(Simulator):
     def memory_estimate(self, step_count: int, *, worlds: int | None = None) -> int:
         """Bytes of a rollout of rows and T steps, `step_count` of them together."""
         return self._simulator.memory_estimate(max(1, step_count - self.rows), worlds=worlds)
-
-    def release_memory(self) -> None:
-        """See `Simulator`."""
-        self._simulator.release_memory()

@@ -56,7 +56,7 @@ def planner(task, **options):
 
 
 def test_a_plan_that_is_better_than_rest_counts(task):
-    kept = planner(task, outlasts_rest=True).run(stages=2).stages
+    kept = planner(task, compared_with_rest=True).run(stages=2).stages
     lost = planner(task).run(stages=2).stages
     assert [result.status for result in lost] == [Status.NO_IMPROVEMENT]
     assert [result.status for result in kept] == [Status.FINISHED] * 2
@@ -70,7 +70,7 @@ def test_a_plan_that_is_better_than_rest_counts(task):
 
 def test_where_nothing_moves_it_makes_no_difference(task):
     still = dataclasses.replace(planner(task), simulator=SimulatorToy(task.scene, batch_size=4))
-    found, expected = (dataclasses.replace(still, outlasts_rest=rests).run(stages=1).stages[0] for rests in (True, False))
+    found, expected = (dataclasses.replace(still, compared_with_rest=rests).run(stages=1).stages[0] for rests in (True, False))
     assert torch.equal(found.actions, expected.actions)
     assert (found.loss, found.loss_before, found.status) == (expected.loss, expected.loss_before, expected.status)
     assert found.rollouts == expected.rollouts + 1

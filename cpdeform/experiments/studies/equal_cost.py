@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import time
 import uuid
@@ -15,6 +16,7 @@ from cpdeform.core.plugins import Registry
 from cpdeform.core.reading.json_text import read_json
 from cpdeform.core.task import Task
 from cpdeform.experiments.experiment_plan import plain_name
+from cpdeform.planning.strategies.sculpt import StrategySculpt
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record_files import write_json
 
@@ -23,10 +25,6 @@ SHARES = "rollout-shares"
 
 POPULATION, SAMPLES, KEPT = 16, 32, 3
 """Plans of a generation of `cma`, samples of a round of `mppi`, descents of `sampled-gradients`."""
-
-TOUCHES, VARIATIONS, POLISHED, ROW = 96, 32, (10, 2), (4, 8)
-"""What a stage of `sculpt` draws, varies in each of two rounds and polishes in two steps, and the gradients of each of these, at
-full size."""
 
 JOINT_SHARE = 0.25
 """Part of a stage's cost that `sculpt` spends in a descent over the touch that it has found."""
@@ -140,19 +138,18 @@ def budget_values(method: str, cost: float, *, share: float, iterations: int) ->
 
 def _touches(cost: float, *, share: float) -> dict[str, Any]:
     """Options of `sculpt`: fewer touches and fewer of them polished, each stage by itself."""
-    joint = max(1, round(JOINT_SHARE * cost))
-    part = (cost - joint) / (
-        share * (TOUCHES + 2 * VARIATIONS) + sum(count * row for count, row in zip(POLISHED, ROW, strict=True))
-    )
-    polished = tuple(max(1, round(part * count)) for count in POLISHED)
+    full, joint = StrategySculpt(), max(1, round(JOINT_SHARE * cost))
+    steps = list(zip(full.polished, full.iterations, strict=True))
+    rollouts, gradients = full.touches + 2 * full.variations, sum(math.prod(step) for step in steps)
+    part = (cost - joint) / (share * rollouts + gradients)
+    polished = tuple(max(1, round(part * count)) for count in full.polished)
     # One candidate may be more than the part of a step; its gradients then make up for it.
-    rows = tuple(max(1, round(part * count * row / kept)) for count, row, kept in zip(POLISHED, ROW, polished, strict=True))
-    sizes = {"touches": TOUCHES, "variations": VARIATIONS}
-    found: dict[str, Any] = {name: max(2, round(part * size)) for name, size in sizes.items()}
+    iterations = tuple(max(1, round(part * math.prod(step) / kept)) for step, kept in zip(steps, polished, strict=True))
     return {
-        **found,
+        "touches": max(2, round(part * full.touches)),
+        "variations": max(2, round(part * full.variations)),
         "polished": polished,
-        "iterations": rows,
+        "iterations": iterations,
         "together": 1,
         "joint_iterations": joint,
         "interim_iterations": joint,

@@ -55,7 +55,8 @@ class Phase(abc.ABC):
 
         Args:
             loss: Its loss, from a fresh evaluation of the stage's objective.
-            loss_before: Loss of leaving the stage's state as it is.
+            loss_before: Loss that a plan has to be below: that of the stage's state, or of what it becomes if it is left alone
+                (`Planner.compared_with_rest`).
             loss_now: Loss of the plan that it would replace; `loss_before` where there is none.
         """
         return loss < loss_before

@@ -265,7 +265,8 @@ def from_rest(planner: Planner, start: Start) -> tuple[Planner, Start]:
     goal = _settled(simulator, start.goal)
     objective = _from_rest(planner.objective, first, goal)
     state = start.state if start.previous or start.first_stage else first
-    return dataclasses.replace(planner, objective=objective, outlasts_rest=True), dataclasses.replace(start, state=state, goal=goal)
+    planner = dataclasses.replace(planner, objective=objective, compared_with_rest=True)
+    return planner, dataclasses.replace(start, state=state, goal=goal)
 
 
 def _from_rest(objective: Objective, first: State, goal: Tensor) -> Objective:
