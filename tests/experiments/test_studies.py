@@ -109,7 +109,7 @@ def test_every_method_is_sized_for_the_budget(method, cost, share):
         assert StrategySculpt(**options).together == 1
         rollouts = options["touches"] + 2 * options["variations"]
         gradients = sum(math.prod(step) for step in zip(options["polished"], options["iterations"], strict=True))
-        gradients += options["joint_iterations"]
+        gradients += options["joint_gradients"]
     else:
         gradients, rollouts = optimizer["iterations"] * options["keep"], options["samples"]
     assert gradients + share * rollouts == pytest.approx(cost, rel=0.35)

@@ -20,7 +20,6 @@ from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.descent import PhaseDescent
 from cpdeform.planning.pruner import PrunerNone
 from cpdeform.planning.result import Observer, Status
-from cpdeform.planning.strategies import sculpt
 from cpdeform.planning.strategies.sculpt import StrategySculpt, joint_optimizer
 from cpdeform.run.deform import deform
 from cpdeform.run.record import RunRecorder, load_record
@@ -154,7 +153,7 @@ class Interrupt(Observer):
 
 
 def sculpted(task, *, simulator=SimulatorChained, changes=None, **options):
-    numbers = {"touches": 8, "variations": 4, "iterations": (1, 1), "together": 2, "joint_iterations": 5, **(changes or {})}
+    numbers = {"touches": 8, "variations": 4, "iterations": (1, 1), "together": 2, "joint_gradients": 10, **(changes or {})}
     strategy = StrategySculpt(**numbers)
     parts = {"simulator": simulator(task.scene, batch_size=4), "ot_solver": OTSolverToy()}
     return deform(task, strategy=strategy, settings={"objective": {"points": None}}, **parts, seed=1, **options)
@@ -171,11 +170,11 @@ def test_the_strategy_polishes_two_stages_at_a_time(task):
 
 def test_the_estimate_counts_the_gradients_that_joint_descents_compute(task):
     """Neither stages nor descents stop early here, so that what is told at most is what is computed."""
-    changes = {"together": 3, "joint_every": 1, "joint_iterations": 5, "interim_iterations": 2}
+    changes = {"together": 3, "joint_every": 1, "joint_gradients": 15, "interim_gradients": 4}
     efforts = StrategySculpt(**changes).joint_efforts(SimulatorChained(task.scene), stages=3)
     found = [(effort.after, effort.stages, effort.iterations) for effort in efforts]
     assert found == [
-        (1, 1, (2, 2)),
+        (1, 1, (4, 4)),
         (2, 2, (2, 2)),
         (3, 3, (5, 5)),
     ]
@@ -188,27 +187,25 @@ def test_the_estimate_counts_the_gradients_that_joint_descents_compute(task):
     assert StrategySculpt(**changes).joint_efforts(SimulatorToy(task.scene), stages=3) == ()
 
 
-def test_few_stages_are_polished_again_as_long_as_it_pays(task, monkeypatch):
-    """At most as often as makes a whole row's gradients, which the estimate says."""
-    changes = {"together": 6, "joint_every": 3}
-    (effort,) = StrategySculpt(joint_iterations=5, **changes).joint_efforts(SimulatorChained(task.scene), stages=3)
-    assert effort.iterations == (5, 10)
-    counts = []
-    for worth in (-1.0, 1.0):
-        monkeypatch.setattr(sculpt, "WORTH_ANOTHER", worth)
-        result = sculpted(task, changes=changes)
-        counts.append(sum(iteration.phase == PHASE for stage in result.stages for iteration in stage.history))
-    assert counts == [10, 5]
-
-
 def test_the_longer_a_row_the_smaller_its_steps():
-    rates = [joint_optimizer(stages=stages, iterations=15).learning_rate for stages in (1, 4, 6, 12)]
+    rates = [joint_optimizer(stages=stages, gradients=180).learning_rate for stages in (1, 4, 6, 12)]
     assert rates == pytest.approx([0.06, 0.06, 0.04, 0.02])
+
+
+def test_rows_of_any_length_have_the_same_gradients_but_short_ones_an_end():
+    counts = [joint_optimizer(stages=stages, gradients=960).iterations for stages in (1, 6, 7, 12, 1000)]
+    assert counts == [160, 160, 137, 80, 1]
+
+
+def test_patience_does_not_end_a_joint_descent_before_its_small_steps():
+    optimizer = joint_optimizer(stages=1, gradients=60)
+    assert optimizer.annealed
+    assert optimizer.patience >= optimizer.iterations
 
 
 def test_stages_are_polished_on_the_way_and_once_more_at_the_end(task):
     """All three together at the end; the first two on their way, and the third one goes on from where these then end."""
-    result = sculpted(task, changes={"together": 3, "joint_every": 2, "interim_iterations": 2})
+    result = sculpted(task, changes={"together": 3, "joint_every": 2, "joint_gradients": 15, "interim_gradients": 4})
     counts = [sum(iteration.phase == PHASE for iteration in stage.history) for stage in result.stages]
     assert counts == [0, 2, 5]
     first, second, third = result.stages
@@ -261,8 +258,7 @@ def test_a_record_holds_the_revised_stages(task, tmp_path):
     assert [stage.index for stage in early[0]] == [0, 1]
     assert record.stages[1].loss < early[0][1].loss
     revisions = [line for line in record.metrics if line["kind"] == "revision"]
-    # The third stage is a row of its own, and may have the gradients of two.
-    assert [(line["stage"], line["stages"]) for line in revisions] == [(1, 2), (2, 1), (2, 1)]
+    assert [(line["stage"], line["stages"]) for line in revisions] == [(1, 2), (2, 1)]
     assert revisions[0]["loss"] == record.stages[1].loss
     assert record.run["stages_finished"] == 3
 

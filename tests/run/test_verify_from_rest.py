@@ -6,7 +6,7 @@ from cpdeform.run.deform import deform
 from cpdeform.run.record import load_record, save_result
 from cpdeform.run.verify import verify_record
 
-SMALL = {"touches": 2, "variations": 1, "polished": (1, 1), "iterations": (1, 1), "joint_iterations": 2, "together": 1}
+SMALL = {"touches": 2, "variations": 1, "polished": (1, 1), "iterations": (1, 1), "joint_gradients": 2, "together": 1}
 """Options of `sculpt` for a stage of a few seconds."""
 
 

@@ -151,6 +151,5 @@ def _touches(cost: float, *, share: float) -> dict[str, Any]:
         "polished": polished,
         "iterations": iterations,
         "together": 1,
-        "joint_iterations": joint,
-        "interim_iterations": joint,
+        "joint_gradients": joint,
     }

@@ -41,8 +41,11 @@ JOINT_STEP, LARGEST_JOINT_STEP = 0.24, 0.06
 """Adam's step size in a joint descent, times the number of stages, and the largest one, units of action. A row of stages errs
 together: the longer it is, the more of what the touches have gained a step undoes."""
 
-WORTH_ANOTHER = 0.02
-"""Share of the loss that a joint descent at the end has to take off to be followed by another one."""
+LONGEST_JOINT_DESCENT = 160
+"""The most iterations of a joint descent: few stages do not need all the gradients that many do."""
+
+WORTH_GOING_ON = 0.02
+"""Share of the loss that the joint descent after stages without a gain has to take off for the run to go on."""
 
 SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
@@ -65,9 +68,9 @@ class StrategySculpt(Strategy):
         polished: Candidates of the first step of polishing, in which all kinds of touches take their turn, and of the second.
         iterations: Gradient evaluations of each of them in these steps.
         together: Stages that are polished together.
-        joint_iterations: Gradient evaluations of each of them in one such descent.
+        joint_gradients: Gradient evaluations of that descent, of all these stages together.
         joint_every: Stages after which those found so far are polished together on the way.
-        interim_iterations: Gradient evaluations of each of them in that.
+        interim_gradients: Gradient evaluations of that, of all of them together.
         coarse: Whether touches are screened with fewer particles, where there are many; see `cpdeform.planning.coarse`.
         idle: Stages without a gain in a row after which the run ends, unless the joint descent that follows gains.
 
@@ -85,15 +88,15 @@ class StrategySculpt(Strategy):
         polished: tuple[int, int] = (10, 2),
         iterations: tuple[int, int] = (4, 8),
         together: int = 12,
-        joint_iterations: int = 40,
+        joint_gradients: int = 960,
         joint_every: int = 3,
-        interim_iterations: int = 15,
+        interim_gradients: int = 120,
         coarse: bool = True,
         idle: int = 3,
     ) -> None:
         numbers = {"touches": touches, "variations": variations, "idle": idle}
-        numbers |= {"together": together, "joint_iterations": joint_iterations}
-        numbers |= {"joint_every": joint_every, "interim_iterations": interim_iterations}
+        numbers |= {"together": together, "joint_gradients": joint_gradients}
+        numbers |= {"joint_every": joint_every, "interim_gradients": interim_gradients}
         numbers |= {"polished": min(polished), "iterations": min(iterations)}
         for name, number in numbers.items():
             if number < 1:
@@ -101,7 +104,7 @@ class StrategySculpt(Strategy):
         self.touches, self.variations, self.idle = touches, variations, idle
         self.polished, self.iterations = tuple(polished), tuple(iterations)
         self.together, self.joint_every, self.coarse = together, joint_every, coarse
-        self._interim, self._joint = interim_iterations, joint_iterations
+        self._interim, self._joint = interim_gradients, joint_gradients
 
     def settings(self, task: Task, *, placer: str | None) -> Mapping[str, Any]:
         """The placer of touches, and the loss that sees crumbs."""
@@ -144,9 +147,8 @@ class StrategySculpt(Strategy):
             for part in _parts(chapter, self.joint_every):
                 last = part[-1] == chapter[-1]
                 count = part[-1] + 1 - chapter[0]
-                least, most = joint_optimizer(stages=count, iterations=self._joint if last else self._interim).effort(1).gradients
-                rounds = self._rounds(count) if last else 1
-                efforts.append(JointEffort(after=part[-1] + 1, stages=count, iterations=(least, rounds * most)))
+                optimizer = joint_optimizer(stages=count, gradients=self._joint if last else self._interim)
+                efforts.append(JointEffort(after=part[-1] + 1, stages=count, iterations=optimizer.effort(1).gradients))
         return tuple(efforts)
 
     def loop(self, planner: Planner, start: Start) -> Iterator[StageResult | Revision]:
@@ -167,14 +169,10 @@ class StrategySculpt(Strategy):
                 over = self._is_over([*finished, *held], counted)
                 last = over or len(held) == len(stages)
                 first = held[-1].loss
-                for _ in range(self._rounds(_planned(held)) if last else 1):
-                    before = held[-1].loss
-                    for revision in self._polished(planner, held, self._joint if last else self._interim):
-                        held = list(revision.results)
-                        yield revision
-                    if before - held[-1].loss < WORTH_ANOTHER * before:
-                        break
-                if over and (held[-1].status is Status.NON_FINITE or first - held[-1].loss < WORTH_ANOTHER * first):
+                for revision in self._polished(planner, held, self._joint if last else self._interim):
+                    held = list(revision.results)
+                    yield revision
+                if over and (held[-1].status is Status.NON_FINITE or first - held[-1].loss < WORTH_GOING_ON * first):
                     return
                 if over:
                     counted = len(finished) + len(held)
@@ -184,16 +182,12 @@ class StrategySculpt(Strategy):
         """The stages up to the next joint descent."""
         return stages[done : (done // self.joint_every + 1) * self.joint_every]
 
-    def _rounds(self, planned: int) -> int:
-        """The most joint descents at the end of a row, by its stages with a plan: few may have as many gradients as many."""
-        return max(1, self.together // max(planned, 1))
-
-    def _polished(self, planner: Planner, held: list[StageResult], iterations: int) -> Iterator[Revision]:
+    def _polished(self, planner: Planner, held: list[StageResult], gradients: int) -> Iterator[Revision]:
         """The stages polished together, where the simulator can; nothing where no stage has a plan."""
-        planned = _planned(held)
+        planned = sum(result.actions is not None for result in held)
         if not (planned and takes_final_gradient(planner.simulator)):
             return
-        optimizer = joint_optimizer(stages=planned, iterations=iterations)
+        optimizer = joint_optimizer(stages=planned, gradients=gradients)
         try:
             yield Revision(tuple(polish_jointly(planner, held, optimizer)), JOINT_POLISH)
         except StagesInterrupted as interruption:
@@ -223,15 +217,15 @@ class StrategySculpt(Strategy):
         return stuck or results[-1].status is Status.NON_FINITE
 
 
-def joint_optimizer(*, stages: int, iterations: int) -> TrajectoryOptimizer:
-    """The optimiser of a joint descent over a number of stages."""
+def joint_optimizer(*, stages: int, gradients: int) -> TrajectoryOptimizer:
+    """The optimiser of a joint descent over a number of stages; an iteration costs a gradient a stage.
+
+    Patience does not end it: where large steps gain nothing more, the smaller ones of its second half still do.
+    """
+    iterations = max(1, min(LONGEST_JOINT_DESCENT, gradients // stages))
     rate = min(LARGEST_JOINT_STEP, JOINT_STEP / stages)
-    return TrajectoryOptimizer(iterations=iterations, learning_rate=rate, pruner=PrunerNone(), annealed=True, **JOINT_DESCENT)
-
-
-def _planned(results: Sequence[StageResult]) -> int:
-    """How many stages have a plan."""
-    return sum(result.actions is not None for result in results)
+    options = {"iterations": iterations, "patience": iterations, "learning_rate": rate, **JOINT_DESCENT}
+    return TrajectoryOptimizer(pruner=PrunerNone(), annealed=True, **options)
 
 
 def _parts(stages: range, size: int) -> list[range]:
