@@ -41,7 +41,7 @@ JOINT_STEP, LARGEST_JOINT_STEP = 0.24, 0.06
 """Adam's step size in a joint descent, times the number of stages, and the largest one, units of action. A row of stages errs
 together: the longer it is, the more of what the touches have gained a step undoes."""
 
-LONGEST_JOINT_DESCENT = 160
+LONGEST_JOINT_DESCENT = 100
 """The most iterations of a joint descent: few stages do not need all the gradients that many do."""
 
 WORTH_GOING_ON = 0.02
