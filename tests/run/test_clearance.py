@@ -67,6 +67,39 @@ def test_the_way_goes_over_the_clay_and_its_ends_are_counted():
     assert bool((through[:, 3:7].norm(dim=-1) == 1.0).all())
 
 
+def test_leaving_a_contact_does_not_count_but_going_deeper_does():
+    far, wall = (0.75, 0.3, 0.5), torch.cartesian_prod(torch.tensor([0.45]), torch.linspace(0.05, 0.15, 11), torch.tensor([0.5]))
+
+    def found(particles):
+        first, second = (stage((start, far), (start, far)) for start in ((0.415, 0.1, 0.5), (0.35, 0.1, 0.5)))
+        first.positions = particles.repeat(2, 1, 1)
+        return measure_clearances(record(first, second)).clearance_way
+
+    # 0.005 deep where it ends; it leaves at once, and ends 0.06 from the wall.
+    assert found(wall) == pytest.approx(0.0, abs=5e-3)
+    assert found(wall) > 0.0
+    # In a narrow pit it scrapes along a ledge on all sides.
+    ring = torch.linspace(0.0, 6.28, 60)[:, None]
+    ledge = torch.cat([0.415 + 0.03 * torch.cos(ring), torch.full_like(ring, 0.14), 0.5 + 0.03 * torch.sin(ring)], dim=1)
+    assert found(torch.cat([wall, ledge])) < -0.008
+
+
+def test_a_tool_under_an_overhang_goes_aside_before_it_rises():
+    """A roof over the tool, open towards +x alone: straight up leads through it."""
+    roof = torch.cartesian_prod(torch.linspace(0.3, 0.5, 21), torch.tensor([0.2]), torch.linspace(0.4, 0.6, 21))
+    wall = torch.cartesian_prod(torch.tensor([0.3]), torch.linspace(0.05, 0.2, 16), torch.linspace(0.4, 0.6, 21))
+    clay, ball = torch.cat([roof, wall]), SCENE.tools[0]
+    through = way(ball, pose(0.5, 0.1, 0.5), pose(0.8, 0.1, 0.5), clay)
+    least = min(float((clay - step[:3]).norm(dim=-1).min()) for step in through) - 0.04
+    assert least == pytest.approx(0.0, abs=1e-3)
+    straight = float((clay - torch.tensor([0.5, 0.2, 0.5])).norm(dim=-1).min()) - 0.04
+    assert straight < -0.03
+    assert torch.allclose(through[0], pose(0.5, 0.1, 0.5))
+    assert torch.allclose(through[-1], pose(0.8, 0.1, 0.5))
+    back = way(ball, pose(0.8, 0.1, 0.5), pose(0.5, 0.1, 0.5), clay)
+    assert torch.allclose(back.flip(0)[:, :3], through[:, :3], atol=1e-6)
+
+
 def test_without_an_executed_stage_there_is_nothing_to_keep_from():
     idle = types.SimpleNamespace(tool_poses=None, positions=None)
     assert measure_clearances(record(idle)) == Clearances(
