@@ -25,7 +25,7 @@ WAY_POSES = 3 * WAY_STEPS
 WAY_HEIGHT = 0.02
 """How far above the clay tools pass over it, length units."""
 
-WAY_SIDE = 0.04
+WAY_SIDE = 0.08
 """How far a tool goes aside before it rises, where it would scrape along the clay otherwise, length units."""
 
 WAY_DIRECTIONS = 8
