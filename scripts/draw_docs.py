@@ -1,7 +1,7 @@
 """Draw all pictures of README and docs: `make pictures`, or some: `python scripts/draw_docs.py writer page goals-multi-stage-1`.
 
 ``writer`` is a run of the task writer, ``sculpted`` and ``sculpted-2`` show runs of tasks of several stages, ``page`` is a
-screenshot of the page of one of them (a headless Chromium is needed); each of these runs takes 10 to 30 minutes. The others are
+screenshot of the page of one of them (a headless Chromium is needed); each of these runs takes 10 to 40 minutes. The others are
 the sheets of all tasks. Runs are kept in ``runs/pictures``: those that are finished are drawn again without being made again.
 Delete the folder to make them anew.
 """
