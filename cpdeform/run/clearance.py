@@ -88,8 +88,7 @@ def way(tool: Tool, end: Tensor, start: Tensor, clay: Tensor) -> Tensor:
         start: Where it has to be (8,); it turns while it is above the clay.
         clay: Particles (N, 3), length units.
     """
-    half = float(surface_points(tool).norm(dim=-1).max())
-    height = min(max(float(clay[:, 1].max()) + half + WAY_HEIGHT, float(end[1]), float(start[1])), 1.0)
+    height = min(max(float(clay[:, 1].max()) + _radius(tool) + WAY_HEIGHT, float(end[1]), float(start[1])), 1.0)
     up, down = (_rising(tool, pose, height, clay) for pose in (end, start))
     share = torch.linspace(0.0, 1.0, WAY_STEPS, dtype=end.dtype)[:, None]
     across = torch.where(share < 0.5, up[-1], down[-1])
@@ -99,7 +98,8 @@ def way(tool: Tool, end: Tensor, start: Tensor, clay: Tensor) -> Tensor:
 
 def _rising(tool: Tool, pose: Tensor, height: float, clay: Tensor) -> Tensor:
     """Poses (`WAY_STEPS`, 8) from one beside the clay up to a height: straight, or aside first where that keeps farther off."""
-    beside = clay[(clay - pose[:3]).norm(dim=-1) < float(surface_points(tool).norm(dim=-1).max()) + 2.0 * WAY_SIDE]
+    # A leg goes straight up at most `WAY_SIDE` from here; clay that is farther off cannot be what decides between legs.
+    beside = clay[(clay[:, ::2] - pose[:3:2]).norm(dim=-1) < _radius(tool) + 2.0 * WAY_SIDE]
     share = torch.linspace(0.0, 1.0, WAY_STEPS, dtype=pose.dtype)
     best = pose.repeat(WAY_STEPS, 1)
     best[:, 1] += share * (height - pose[1])
@@ -129,6 +129,11 @@ def _executed(stage: StageResult) -> tuple[Tensor, Tensor]:
 def _movable(scene: Scene, poses: Tensor) -> list[tuple[Tool, Tensor]]:
     """The movable tools with their poses (8,) out of (M, 8)."""
     return [(tool, poses[index]) for index, tool in enumerate(scene.tools) if tool.movable]
+
+
+def _radius(tool: Tool) -> float:
+    """Distance of a tool's farthest point from its middle, length units."""
+    return float(surface_points(tool).norm(dim=-1).max())
 
 
 def _least_to_clay(tool: Tool, poses: Tensor, clay: Tensor) -> float:

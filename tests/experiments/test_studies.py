@@ -92,7 +92,7 @@ def test_presets_stay_below_what_a_task_asks_for():
 
 
 @pytest.mark.parametrize("method", ["fixed", "random", "restarts", "bayesopt", "cma", "mppi", "sculpt", "sampled-gradients"])
-@pytest.mark.parametrize(("cost", "share"), [(24.0, 0.2), (90.0, 0.25), (7.5, 0.5)])
+@pytest.mark.parametrize(("cost", "share"), [(24.0, 0.2), (90.0, 0.25), (7.5, 0.5), (900.0, 0.2)])
 def test_every_method_is_sized_for_the_budget(method, cost, share):
     found = budget_values(method, cost, share=share, iterations=8)
     options, optimizer = found.get("strategy_options", {}), found.get("optimizer", {})

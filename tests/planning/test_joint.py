@@ -197,10 +197,13 @@ def test_rows_of_any_length_have_the_same_gradients_but_short_ones_an_end():
     assert counts == [100, 100, 100, 80, 1]
 
 
-def test_patience_does_not_end_a_joint_descent_before_its_small_steps():
-    optimizer = joint_optimizer(stages=1, gradients=60)
-    assert optimizer.annealed
-    assert optimizer.patience >= optimizer.iterations
+def test_patience_does_not_end_a_joint_descent_before_its_small_steps(task):
+    """The toy's clay is where it should be long before: patience ended the descent there."""
+    result = sculpted(task, changes={"together": 1, "joint_gradients": 60})
+    counts = [
+        sum(iteration.phase == PHASE for iteration in stage.history) for stage in result.stages if stage.status is Status.FINISHED
+    ]
+    assert counts == [60, 60]
 
 
 def test_stages_are_polished_on_the_way_and_once_more_at_the_end(task):
