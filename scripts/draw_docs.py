@@ -1,9 +1,9 @@
 """Draw all pictures of README and docs: `make pictures`, or some: `python scripts/draw_docs.py writer page goals-multi-stage-1`.
 
-``writer`` is a run of the task writer, ``sculpted`` and ``sculpted-2`` show runs of tasks of several stages, ``page`` is a
-screenshot of the page of one of them (a headless Chromium is needed); each of these runs takes 10 to 40 minutes. The others are
-the sheets of all tasks. Runs are kept in ``runs/pictures``: those that are finished are drawn again without being made again.
-Delete the folder to make them anew.
+``writer`` is a run of the task writer, ``sculpted`` and ``sculpted-2`` show runs of tasks of several stages, ``meshes`` those
+of three meshes, ``page`` is a screenshot of the page of one of them (a headless Chromium is needed); each of these runs takes 10 to
+40 minutes. The others are the sheets of all tasks. Runs are kept in ``runs/pictures``: those that are finished are drawn again
+without being made again. Delete the folder to make them anew.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+
+from own_meshes import FILES, UPWARDS, write_meshes
 
 from cpdeform.tasks.draw_goals import SHEETS
 
@@ -28,10 +30,17 @@ CAMERAS = {
     "rope++": "top",
     "move++": "top",
     "pinch": "default",
+    "bowl": "default",
+    "heart": "top",
+    "mug": "default",
 }
 """Tasks of the pictures of sculpted shapes, and where they are looked at from."""
-SCULPTED = {"sculpted": ("star", "airplane", "bottle", "chair"), "sculpted-2": ("rope++", "move++", "pinch")}
-"""Pictures and their rows: that of the README, and what the results page shows beside it."""
+SCULPTED = {
+    "sculpted": ("star", "airplane", "bottle", "chair"),
+    "sculpted-2": ("rope++", "move++", "pinch"),
+    "meshes": ("bowl", "heart", "mug"),
+}
+"""Pictures and their rows: that of the README, what the results page shows beside it, and runs of `own_meshes`."""
 TOUCHES_SHOWN = 3
 """Touches of a run in such a picture, from its first one on."""
 ENDED = ("finished", "no_improvement")
@@ -104,8 +113,20 @@ def run(task: str) -> Path:
     directory = RUNS / task
     record = directory / "run.json"
     if not record.exists() or json.loads(record.read_text(encoding="utf-8"))["status"] not in ENDED:
-        command("run", task, "--no-pictures", "--overwrite", "--out", str(directory))
+        source = str(mesh_task(task)) if task in FILES else task
+        command("run", source, "--no-pictures", "--overwrite", "--out", str(directory))
     return directory
+
+
+def mesh_task(name: str) -> Path:
+    """The task file of a mesh, made unless it is there."""
+    folder = RUNS / "meshes"
+    path = folder / f"{name}.yaml"
+    if not path.exists():
+        write_meshes(folder)
+        up = ["--up", UPWARDS[name]] if name in UPWARDS else []
+        subprocess.run([sys.executable, "-m", "cpdeform", "task", "new", name, "--goal", FILES[name], *up], cwd=folder, check=True)
+    return path
 
 
 def shrink(data: bytes, path: Path) -> None:

@@ -16,7 +16,7 @@ from cpdeform.core.plugins import Registry
 from cpdeform.core.reading.json_text import read_json
 from cpdeform.core.task import Task
 from cpdeform.experiments.experiment_plan import plain_name
-from cpdeform.planning.strategies.sculpt import LONGEST_JOINT_DESCENT, StrategySculpt
+from cpdeform.planning.strategies.sculpt import StrategySculpt, joint_optimizer
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record_files import write_json
 
@@ -140,7 +140,7 @@ def _touches(cost: float, *, share: float) -> dict[str, Any]:
     """Options of `sculpt`: fewer touches and fewer of them polished, each stage by itself."""
     full = StrategySculpt()
     # What a joint descent may not use goes to the touches.
-    joint = max(1, min(LONGEST_JOINT_DESCENT, round(JOINT_SHARE * cost)))
+    joint = joint_optimizer(stages=1, gradients=round(JOINT_SHARE * cost)).iterations
     steps = list(zip(full.polished, full.iterations, strict=True))
     rollouts, gradients = full.touches + 2 * full.variations, sum(math.prod(step) for step in steps)
     part = (cost - joint) / (share * rollouts + gradients)

@@ -41,8 +41,9 @@ JOINT_STEP, LARGEST_JOINT_STEP = 0.24, 0.06
 """Adam's step size in a joint descent, times the number of stages, and the largest one, units of action. A row of stages errs
 together: the longer it is, the more of what the touches have gained a step undoes."""
 
-LONGEST_JOINT_DESCENT = 100
-"""The most iterations of a joint descent: few stages do not need all the gradients that many do."""
+LONGEST_JOINT_DESCENT, FEW_STAGES = 80, 6
+"""The most iterations of a joint descent, and the stages below which it has more of them, for the same gradients: over six stages
+there is little to gain after 80, over three there still is."""
 
 WORTH_GOING_ON = 0.02
 """Share of the loss that the joint descent after stages without a gain has to take off for the run to go on."""
@@ -222,7 +223,8 @@ def joint_optimizer(*, stages: int, gradients: int) -> TrajectoryOptimizer:
 
     Patience does not end it: where large steps gain nothing more, the smaller ones of its second half still do.
     """
-    iterations = max(1, min(LONGEST_JOINT_DESCENT, gradients // stages))
+    most = LONGEST_JOINT_DESCENT * max(FEW_STAGES, stages)
+    iterations = max(1, min(gradients, most) // stages)
     rate = min(LARGEST_JOINT_STEP, JOINT_STEP / stages)
     options = {"iterations": iterations, "patience": iterations, "learning_rate": rate, **JOINT_DESCENT}
     return TrajectoryOptimizer(pruner=PrunerNone(), annealed=True, **options)
