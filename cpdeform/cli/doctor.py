@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 PARTS = {"simulator": "--backend", "ot_solver": "--ot"}
 NO_COMPILER = "none: the native simulator and solver cannot be built; Warp and GeomLoss take their place"
 COMPILERS = ("c++", "g++", "clang++", "cl")
+TEXT_INDENT = 10
+"""Where the text begins after ``system``, ``versions`` and the like."""
 EXTRAS = {"pictures": "report", "meshes": "meshes"}
 """What needs packages of an extra."""
 
@@ -94,6 +96,7 @@ def _caches() -> dict[str, str]:
 
 
 def _text(found: dict[str, Any]) -> str:
+    from cpdeform.cli.wrapped import wrapped
     from cpdeform.core.wording import counted
 
     versions = ", ".join(f"{name} {version or 'missing'}" for name, version in found["versions"].items())
@@ -113,7 +116,7 @@ def _text(found: dict[str, Any]) -> str:
         *(f"{what:<9} {_missing(found[what], extra)}" for what, extra in EXTRAS.items()),
         *(f"cache     {name}: {folder}" for name, folder in found["caches"].items()),
     ]
-    return "\n".join(lines)
+    return "\n".join(wrapped(line, indent=TEXT_INDENT) for line in lines)
 
 
 def _missing(packages: dict[str, bool], extra: str) -> str:

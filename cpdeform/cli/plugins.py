@@ -16,6 +16,7 @@ def plugins(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON
 
     Every part is imported, to tell whether it can be used; this takes some seconds.
     """
+    from cpdeform.cli.wrapped import wrapped
     from cpdeform.core.plugins import load_registry
 
     registry = load_registry()
@@ -36,9 +37,9 @@ def plugins(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON
         if part["kind"] != kind:
             kind = part["kind"]
             typer.echo(kind)
-        typer.echo(f"  {part['name']:<{width}} {part['summary']}  [{part['distribution']}]")
+        typer.echo(wrapped(f"  {part['name']:<{width}} {part['summary']}  [{part['distribution']}]", indent=width + 3))
         if not part["available"]:
-            typer.echo(f"  {'':<{width}} not available: {part['reason']}")
+            typer.echo(wrapped(f"  {'':<{width}} not available: {part['reason']}", indent=width + 3))
     if tasks:
         typer.echo(f"task\n  {len(tasks)} tasks, see `cpdeform tasks`")
     for failure in failures:

@@ -14,7 +14,9 @@ from children import child_environment
 from typer.testing import CliRunner
 
 from cpdeform.cli.bench_output import _print_table
+from cpdeform.cli.doctor import doctor
 from cpdeform.cli.main import app
+from cpdeform.cli.plugins import plugins
 from cpdeform.core.errors import PluginError
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.state import State
@@ -127,6 +129,20 @@ def test_tables_fit_a_narrow_terminal(monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     assert any(line.split() == ["figure", "11", "1"] for line in lines)
+
+
+@pytest.mark.parametrize("command", [plugins, doctor])
+def test_lists_fit_a_narrow_terminal(command, monkeypatch, capsys):
+    command()
+    whole = capsys.readouterr().out
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", "80")
+    command()
+    narrow = capsys.readouterr().out
+    assert max(map(len, whole.splitlines())) > 80
+    # A path without a space stays in one piece.
+    assert all(len(line) <= 80 or " " not in line.strip() for line in narrow.splitlines())
+    assert narrow.split() == whole.split()
 
 
 def test_plugins_do_not_repeat_the_tasks(directory):
