@@ -30,6 +30,7 @@ CAMERAS = {
     "rope++": "top",
     "move++": "top",
     "pinch": "default",
+    "airplane-1000": "top",
     "bowl": "default",
     "heart": "top",
     "mug": "default",
@@ -37,10 +38,12 @@ CAMERAS = {
 """Tasks of the pictures of sculpted shapes, and where they are looked at from."""
 SCULPTED = {
     "sculpted": ("star", "airplane", "bottle", "chair"),
-    "sculpted-2": ("rope++", "move++", "pinch"),
+    "sculpted-2": ("rope++", "move++", "pinch", "airplane-1000"),
     "meshes": ("bowl", "heart", "mug"),
 }
 """Pictures and their rows: that of the README, what the results page shows beside it, and runs of `own_meshes`."""
+GENERATED = {"airplane-1000": ("airplane", 1000)}
+"""Rows that are a task with a generated goal: task and seed."""
 TOUCHES_SHOWN = 3
 """Touches of a run in such a picture, from its first one on."""
 ENDED = ("finished", "no_improvement")
@@ -113,9 +116,18 @@ def run(task: str) -> Path:
     directory = RUNS / task
     record = directory / "run.json"
     if not record.exists() or json.loads(record.read_text(encoding="utf-8"))["status"] not in ENDED:
-        source = str(mesh_task(task)) if task in FILES else task
-        command("run", source, "--no-pictures", "--overwrite", "--out", str(directory))
+        source = [str(mesh_task(task))] if task in FILES else generated(task) if task in GENERATED else [task]
+        command("run", *source, "--no-pictures", "--overwrite", "--out", str(directory))
     return directory
+
+
+def generated(name: str) -> list[str]:
+    """A task with its generated goal, as options of `cpdeform run`."""
+    task, seed = GENERATED[name]
+    goal = RUNS / "goals" / f"{name}.npz"
+    goal.parent.mkdir(parents=True, exist_ok=True)
+    command("task", "generate", task, "--seed", str(seed), "--out", str(goal), "--overwrite")
+    return [task, "--goal", str(goal)]
 
 
 def mesh_task(name: str) -> Path:
