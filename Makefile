@@ -71,8 +71,8 @@ GOALS ?=
 goals: $(NATIVE)
 	$(BIN)/python -m cpdeform.tasks.make_goals --check $(GOALS)
 
-# All pictures of README and docs; `make pictures PICTURES="writer goals-multi-stage-1"` draws some of them. The page needs Chromium,
-# and a run of half an hour, which is kept in runs/pictures.
+# All pictures of README and docs; `make pictures PICTURES="writer goals-multi-stage-1"` draws some of them. The page needs Chromium.
+# Some hours of runs, which are kept in runs/pictures.
 PICTURES ?=
 pictures: $(NATIVE)
 	$(BIN)/python scripts/draw_docs.py $(PICTURES)

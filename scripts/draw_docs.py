@@ -116,13 +116,16 @@ def run(task: str) -> Path:
     directory = RUNS / task
     record = directory / "run.json"
     if not record.exists() or json.loads(record.read_text(encoding="utf-8"))["status"] not in ENDED:
-        source = [str(mesh_task(task))] if task in FILES else generated(task) if task in GENERATED else [task]
-        command("run", *source, "--no-pictures", "--overwrite", "--out", str(directory))
+        command("run", *arguments_of(task), "--no-pictures", "--overwrite", "--out", str(directory))
     return directory
 
 
-def generated(name: str) -> list[str]:
-    """A task with its generated goal, as options of `cpdeform run`."""
+def arguments_of(name: str) -> list[str]:
+    """What `cpdeform run` has to be told to make a row: a task, one with a generated goal, or that of a mesh."""
+    if name in FILES:
+        return [str(mesh_task(name))]
+    if name not in GENERATED:
+        return [name]
     task, seed = GENERATED[name]
     goal = RUNS / "goals" / f"{name}.npz"
     goal.parent.mkdir(parents=True, exist_ok=True)

@@ -43,7 +43,8 @@ def plugins(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON
     if tasks:
         typer.echo(f"task\n  {len(tasks)} tasks, see `cpdeform tasks`")
     for failure in failures:
-        typer.echo(f"failed to load: {failure['entry_point']} [{failure['distribution']}]: {failure['reason']}")
+        line = f"failed to load: {failure['entry_point']} [{failure['distribution']}]: {failure['reason']}"
+        typer.echo(wrapped(line, indent=width + 3))
 
 
 def _describe(registry: Registry, registration: Registration) -> dict[str, Any]:

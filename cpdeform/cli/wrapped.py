@@ -6,6 +6,9 @@ import shutil
 import sys
 import textwrap
 
+LEAST_WIDTH = 20
+"""Columns of text beside the indent, in however narrow a terminal."""
+
 
 def wrapped(line: str, *, indent: int) -> str:
     """A line broken at the width of the terminal; whole where the output is no terminal, since a program may read it.
@@ -13,16 +16,18 @@ def wrapped(line: str, *, indent: int) -> str:
     Args:
         line: One line.
         indent: Spaces before what goes on below.
+
+    Returns:
+        One line or several.
     """
     if not sys.stdout.isatty():
         return line
     width = shutil.get_terminal_size().columns
+    # Names and paths stay in one piece, so that they can be copied.
     return textwrap.fill(
         line,
-        max(width, indent + 20),
+        max(width, indent + LEAST_WIDTH),
         subsequent_indent=" " * indent,
-        drop_whitespace=True,
-        replace_whitespace=False,
         break_on_hyphens=False,
         break_long_words=False,
     )

@@ -69,9 +69,9 @@ class StrategySculpt(Strategy):
         polished: Candidates of the first step of polishing, in which all kinds of touches take their turn, and of the second.
         iterations: Gradient evaluations of each of them in these steps.
         together: Stages that are polished together.
-        joint_gradients: Gradient evaluations of that descent, of all these stages together.
+        joint_gradients: The most gradient evaluations of that descent, of all these stages together; see `LONGEST_JOINT_DESCENT`.
         joint_every: Stages after which those found so far are polished together on the way.
-        interim_gradients: Gradient evaluations of that, of all of them together.
+        interim_gradients: The most gradient evaluations of that, of all of them together.
         coarse: Whether touches are screened with fewer particles, where there are many; see `cpdeform.planning.coarse`.
         idle: Stages without a gain in a row after which the run ends, unless the joint descent that follows gains.
 
