@@ -47,6 +47,8 @@ class Evaluation:
     Attributes:
         loss: Loss (b,) in float64 on the CPU, objective units; nan where the rollout was not finite.
         gradient: Gradient (b, T, A) of the actions; None where it was not asked for.
+        actions: The actions (b, T, A) that were executed; a simulator may tell others than it was asked for, see
+            `cpdeform.planning.placed.SimulatorPlaced`.
         ends: The particles' final positions (b, N, 3).
         warm: What the objective can start from next time, b entries, or None.
         seconds: Wall time of the parts `rollout`, `objective` and `vjp`.
@@ -55,6 +57,7 @@ class Evaluation:
 
     loss: Tensor
     gradient: Tensor | None
+    actions: Tensor
     ends: Tensor
     warm: tuple[object, ...] | None
     seconds: dict[str, float]
@@ -97,7 +100,7 @@ class Evaluator:
         ends = trajectory.positions[:, -1].detach().clone()
         seconds = {name: marks[i + 1] - marks[i] for i, name in enumerate(("rollout", "objective", "vjp"))}
         warm = None if result is None else result.warm
-        return Evaluation(loss, gradient, ends, warm, seconds, self._memory(batch, gauge))
+        return Evaluation(loss, gradient, trajectory.actions, ends, warm, seconds, self._memory(batch, gauge))
 
     def _memory(self, batch: Batch, gauge: MemoryGauge | None) -> MemoryUse | None:
         if gauge is None:
@@ -146,6 +149,7 @@ def evaluate_worlds(
     return Evaluation(
         loss=torch.cat([item.loss for item in found]),
         gradient=torch.cat(gradients) if gradients else None,
+        actions=torch.cat([item.actions for item in found]),
         ends=torch.cat([item.ends for item in found]),
         warm=tuple(warms) if len(warms) == len(actions) else None,
         seconds={name: sum(item.seconds[name] for item in found) for name in found[0].seconds},

@@ -57,7 +57,7 @@ class SimulatorChain(SimulatorWrapped):
         return Trajectory(
             positions=_joined([part.positions for part in parts]),
             tool_poses=_joined([part.tool_poses for part in parts]),
-            actions=actions.detach().clone(),
+            actions=torch.cat([part.actions for part in parts], dim=1),
             initial_state=state,
             final_state=parts[-1].final_state,
             checkpoints=tuple(parts),

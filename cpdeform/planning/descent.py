@@ -36,11 +36,22 @@ class Descent:
         self._backtrack, self._leap = backtrack, leap
         self._scales = [1.0] * len(self._worlds)
         self._idle = [0] * len(self._worlds)
+        self._bounds = [torch.ones_like(world) for world in actions]
         self._best: dict[int, tuple[float, Tensor, Tensor]] = {}
 
     def actions(self, worlds: Tensor) -> Tensor:
         """Actions (b, T, A) of the worlds with the given indices (b,)."""
         return torch.stack([self._worlds[world].detach() for world in worlds.tolist()])
+
+    def put(self, worlds: Tensor, actions: Tensor) -> None:
+        """Go on from the actions (b, T, A) that were executed, where the simulator tells others than those asked for.
+
+        Where these are beyond [-1, 1], the next ones may be as far beyond.
+        """
+        with torch.no_grad():
+            for world, executed in zip(worlds.tolist(), actions, strict=True):
+                self._worlds[world].copy_(executed)
+                self._bounds[world] = executed.detach().abs().clamp_min(1.0)
 
     def can_return(self, worlds: Tensor) -> Tensor:
         """Whether each of the worlds with the given indices (b,) has a plan to go back to, (b,)."""
@@ -69,7 +80,7 @@ class Descent:
         self._adam.step()
         with torch.no_grad():
             for world in worlds.tolist():
-                self._worlds[world].clamp_(-1.0, 1.0)
+                self._worlds[world].clamp_(-self._bounds[world], self._bounds[world])
 
     def _note(self, world: int, loss: float, gradient: Tensor) -> None:
         """Keep the plan if it is the world's best."""

@@ -63,6 +63,16 @@ class Placing:
         new = torch.cat([place, turned, old[..., 7:]], dim=-1)
         return poses.index_copy(1, torch.tensor(movable, device=poses.device), new)
 
+    def executed(self, poses: Tensor, rows: Tensor, begun: Tensor) -> Tensor:
+        """Rows (B, rows, A) that place the tools where they began, poses `begun` (B, M, 8), as some were moved out of the clay."""
+        movable = self._movable
+        count = NUMBERS * len(movable)
+        numbers = rows.flatten(1)[:, :count].reshape(len(rows), -1, NUMBERS)
+        moved = (begun != self.placed(poses, rows))[:, movable, :3].any(dim=-1, keepdim=True)
+        place = (begun[:, movable, :3] - poses[:, movable, :3]) / self.length
+        found = torch.cat([torch.where(moved & place.isfinite(), place, numbers[..., :3]), numbers[..., 3:]], dim=-1)
+        return torch.cat([found.flatten(1), rows.flatten(1)[:, count:]], dim=1).reshape(rows.shape)
+
     def pulled_back(self, poses: Tensor, rows: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
         """Gradients with respect to poses (B, M, 8) and rows (B, rows, A) of what has gradient `slope` in the placed poses."""
         with torch.enable_grad():
@@ -78,8 +88,10 @@ class Placing:
 class SimulatorPlaced(SimulatorWrapped):
     """A simulator whose first rows of actions place the tools; it takes no time, and the clay stays as it is.
 
-    A tool that would then be inside the clay is moved out of it (`cpdeform.planning.stage_start`); the gradient takes that way as
-    fixed. The trajectory begins where the tools are placed: it has T steps for rows + T actions.
+    A tool that would then be inside the clay is moved out of it (`cpdeform.planning.stage_start`), and the rows that the trajectory
+    tells are those that place it there: a descent that goes on from them walks along the clay's surface. Were it to go on from the
+    rows asked for, the tool would sink deeper with each step, to where the way out leads now to one side, now to another. The
+    trajectory begins where the tools are placed: it has T steps for rows + T actions.
 
     Args:
         simulator: Computes the rollouts.
@@ -99,8 +111,12 @@ class SimulatorPlaced(SimulatorWrapped):
         """Place the tools by the first rows of actions (B, rows + T, A), then follow the others."""
         rows, plan = actions[:, : self.rows], actions[:, self.rows :]
         poses = state.tool_pose if self._placing is None else self._placing.placed(state.tool_pose, rows.to(state.tool_pose))
-        inner = self._simulator.rollout(begin_stage(self.scene, state, poses, plan), plan)
-        return dataclasses.replace(inner, actions=actions.detach().clone(), initial_state=state.clone(), checkpoints=inner)
+        start = begin_stage(self.scene, state, poses, plan)
+        inner = self._simulator.rollout(start, plan)
+        if self._placing is not None:
+            rows = self._placing.executed(state.tool_pose, rows.detach().to(state.tool_pose), start.tool_pose)
+        executed = torch.cat([rows.to(inner.actions), inner.actions], dim=1)
+        return dataclasses.replace(inner, actions=executed, initial_state=state.clone(), checkpoints=inner)
 
     def vjp(
         self,

@@ -96,6 +96,8 @@ class Race:
             stand_ins=self.best_ends[active.to(self.best_ends.device)],
             measured=measured,
         )
+        tried = found.actions.to(tried)
+        self.descent.put(active, tried)
         gradient = _with_rest(found, rest_steps)
         self.evaluations += len(active)
         for place, world in enumerate(active.tolist()):

@@ -9,12 +9,15 @@ import torch
 from backend_cases import BACKENDS, CASES, actions_for, backend_class, scene, stirred, tool
 
 from cpdeform.core.clearance import CLEARANCE
+from cpdeform.core.objective import ObjectiveAutograd
 from cpdeform.core.rotation import conjugate, multiply
 from cpdeform.core.scene import Scene
 from cpdeform.core.signed_distance import signed_distance
-from cpdeform.core.simulator import Simulator
+from cpdeform.core.simulator import Simulator, Trajectory
 from cpdeform.core.state import State
+from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.placed import ANGLE, LENGTH, Placing, SimulatorPlaced
+from cpdeform.planning.pruner import PrunerNone
 
 STEPS = 3
 
@@ -131,6 +134,43 @@ def test_a_tool_that_would_be_placed_in_the_clay_begins_outside() -> None:
     assert float(signed_distance(first, inside[0, 0], start.position[0]).min()) < -CLEARANCE
     placed = SimulatorPlaced(simulator, placing).rollout(start, actions)
     assert float(signed_distance(first, placed.tool_poses[0, 0, 0], start.position[0]).min()) >= 0.99 * CLEARANCE
+    # The trajectory tells the rows that place it there.
+    rows, plan = placing.split(placed.actions)
+    torch.testing.assert_close(placing.placed(start.tool_pose, rows), placed.tool_poses[:, 0])
+    assert torch.equal(rows[..., 3:], actions[:, : placing.rows, 3:])
+    assert torch.equal(plan, placing.split(actions)[1])
+    again = SimulatorPlaced(simulator, placing).rollout(start, placed.actions)
+    torch.testing.assert_close(again.positions, placed.positions)
+
+
+class Height(ObjectiveAutograd):
+    """How high the first tool begins."""
+
+    def loss(self, positions: torch.Tensor, tool_poses: torch.Tensor) -> torch.Tensor:
+        return tool_poses[:, 0, 0, 1]
+
+
+def test_a_descent_into_the_clay_stays_on_its_surface() -> None:
+    """A plan that sinks has its tool moved out, some day to another side, where the loss leaps."""
+    simulator = backend_class("warp")(CASES["two tools"], dtype=torch.float64)
+    placing, start = Placing(scene=simulator.scene, length=0.05), free(simulator)
+    optimizer = TrajectoryOptimizer(iterations=12, learning_rate=0.1, pruner=PrunerNone(), backtrack=None)
+    asked: list[torch.Tensor] = []
+
+    class Told(SimulatorPlaced):
+        def rollout(self, state: State, actions: torch.Tensor) -> Trajectory:
+            asked.append(placing.placed(state.tool_pose, placing.split(actions)[0])[0, 0])
+            return super().rollout(state, actions)
+
+    found = optimizer.minimize(Told(simulator, placing), start, placing.before(descending(simulator)), Height())
+    first = simulator.scene.tools[0]
+    depths = [float(signed_distance(first, pose, start.position[0]).min()) for pose in asked]
+    assert depths[0] > 0.01
+    assert min(depths) < 0.0
+    # Of twelve steps of 0.005, four lead to the surface; the others do not add up.
+    assert min(depths) > -0.0055
+    begun = placing.placed(start.tool_pose, placing.split(found.actions)[0])[0, 0]
+    assert float(signed_distance(first, begun, start.position[0]).min()) > 0.0
 
 
 def test_without_a_placing_there_are_no_rows() -> None:

@@ -95,3 +95,15 @@ def test_a_world_that_breaks_goes_back_at_once():
     for loss, slope, expected in ((float("nan"), 0.0, 0.15), (0.5, float("nan"), 0.075)):
         descent.step(worlds, torch.tensor([loss]), torch.full((1, 1, 1), slope), learning_rate=0.3)
         torch.testing.assert_close(descent.actions(worlds), torch.full((1, 1, 1), expected))
+
+
+def test_it_goes_on_from_what_was_executed():
+    descent, worlds = Descent(torch.zeros(2, 1, 1), backtrack=None), torch.arange(2)
+    descent.step(worlds, *evaluate(descent.actions(worlds)), learning_rate=0.3)
+    descent.put(worlds, torch.tensor([0.05, -1.5]).reshape(2, 1, 1))
+    loss, slope = evaluate(descent.actions(worlds))
+    descent.step(worlds, loss, slope, learning_rate=0.01)
+    first, second = descent.actions(worlds).flatten().tolist()
+    assert 0.05 < first < 0.07
+    # Beyond [-1, 1], where it was put there, but no farther.
+    assert -1.5 <= second < -1.0
