@@ -14,8 +14,9 @@ from cpdeform.core.state import State
 from cpdeform.planning.stage_start import begin_stage
 from cpdeform.planning.wrapped import SimulatorWrapped
 
-LENGTH, ANGLE = 0.01, 0.1
-"""How far an action of 1 moves a tool's place (length units) and turns it (radians): about what an action does to it in a step."""
+LENGTH, ANGLE = 0.03, 0.3
+"""How far an action of 1 moves a tool's place (length units) and turns it (radians): a few times what an action does to it in a
+step, so that the steps of a descent place it in time."""
 
 NUMBERS = 6
 """Numbers that place a tool: a move and a rotation vector."""

@@ -121,7 +121,7 @@ def test_a_tool_stays_within_its_bounds() -> None:
     placing = Placing(scene=scene(bounded))
     poses = torch.tensor([[[0.5, 0.2, 0.5, 1.0, 0.0, 0.0, 0.0, 0.0]]])
     rows = torch.ones(1, placing.rows, placing.scene.action_size)
-    torch.testing.assert_close(placing.placed(poses, rows)[0, 0, :3], torch.tensor([0.504, 0.21, 0.51]))
+    torch.testing.assert_close(placing.placed(poses, rows)[0, 0, :3], torch.tensor([0.504, 0.2 + LENGTH, 0.5 + LENGTH]))
 
 
 def test_a_tool_that_would_be_placed_in_the_clay_begins_outside() -> None:
