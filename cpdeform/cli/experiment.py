@@ -58,8 +58,8 @@ def experiment(
     methods: Annotated[
         str | None,
         typer.Option(
-            help="Of cpdeform, tuned, sculpt, paper, fixed, random, restarts, bayesopt, cma, mppi and sampled-gradients, separated "
-            "by commas. Defaults to cpdeform,fixed, or those of the experiment.",
+            help="Of cpdeform, tuned, sculpt, paper, fixed, random, restarts, bayesopt, cma, mppi, sampled-gradients, sac, ppo and "
+            "td3, separated by commas. Defaults to cpdeform,fixed, or those of the experiment.",
             metavar="NAMES",
         ),
     ] = None,

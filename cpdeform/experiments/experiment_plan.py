@@ -42,11 +42,14 @@ METHODS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "cma": {"strategy": "cma"},
         "mppi": {"strategy": "mppi"},
         "sampled-gradients": {"strategy": "sampled-gradients"},
+        "sac": {"strategy": "sac"},
+        "ppo": {"strategy": "ppo"},
+        "td3": {"strategy": "td3"},
     }
 )
 """What each method sets: this project's method, the same with settings tuned for each of the paper's tasks, many touches
-from rest to rest, Algorithm 1 to the letter, PlasticineLab's protocol, the paper's ablation, and the searches of the
-distribution cpdeform-baselines."""
+from rest to rest, Algorithm 1 to the letter, PlasticineLab's protocol, the paper's ablation, and the searches and learners of
+the distribution cpdeform-baselines."""
 
 REFERENCE, BASELINE = "cpdeform", "fixed"
 """With equal evaluations the second gets as many as the first one used."""

@@ -17,7 +17,7 @@ from cpdeform.cli.main import app
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.task import load_task
 from cpdeform.experiments.studies import equal_cost
-from cpdeform.experiments.studies.equal_cost import budget_values, known_shares, rollout_share
+from cpdeform.experiments.studies.equal_cost import JUDGED, budget_values, known_shares, rollout_share
 from cpdeform.experiments.studies.statistics import Interval, mean, rank_correlation
 from cpdeform.experiments.studies.study import PRESETS, STUDIES
 from cpdeform.experiments.studies.trace import learning_curve, stage_points, value_at
@@ -91,7 +91,7 @@ def test_presets_stay_below_what_a_task_asks_for():
     assert all(study.methods[0] == "cpdeform" for study in STUDIES.values())
 
 
-@pytest.mark.parametrize("method", ["fixed", "random", "restarts", "bayesopt", "cma", "mppi", "sculpt", "sampled-gradients"])
+@pytest.mark.parametrize("method", ["fixed", "random", "restarts", "bayesopt", "cma", "mppi", "sculpt", "sampled-gradients", "sac"])
 @pytest.mark.parametrize(("cost", "share"), [(24.0, 0.2), (90.0, 0.25), (7.5, 0.5), (900.0, 0.2)])
 def test_every_method_is_sized_for_the_budget(method, cost, share):
     found = budget_values(method, cost, share=share, iterations=8)
@@ -105,6 +105,8 @@ def test_every_method_is_sized_for_the_budget(method, cost, share):
         rollouts = options["population"] * options["generations"]
     elif method == "mppi":
         rollouts = options["samples"] * (options["updates"] + 1)
+    elif method == "sac":
+        rollouts = options["episodes"] + JUDGED
     elif method == "sculpt":
         assert StrategySculpt(**options).together == 1
         rollouts = options["touches"] + 2 * options["variations"]

@@ -26,6 +26,9 @@ SHARES = "rollout-shares"
 POPULATION, SAMPLES, KEPT = 16, 32, 3
 """Plans of a generation of `cma`, samples of a round of `mppi`, descents of `sampled-gradients`."""
 
+LEARNERS, JUDGED = ("sac", "ppo", "td3"), 3
+"""Learners, whose episodes are rollouts, and the rollouts that each spends on judging what it has learnt."""
+
 JOINT_SHARE = 0.25
 """Part of a stage's cost that `sculpt` spends in a descent over the touch that it has found."""
 
@@ -123,6 +126,8 @@ def budget_values(method: str, cost: float, *, share: float, iterations: int) ->
     if method == "mppi":
         samples = min(SAMPLES, max(2, rollouts // 2))
         return {"strategy_options": {"samples": samples, "updates": max(1, round(rollouts / samples) - 1)}}
+    if method in LEARNERS:
+        return {"strategy_options": {"episodes": max(1, rollouts - JUDGED)}}
     if method == "sculpt":
         return {"strategy_options": _touches(cost, share=share)}
     if method == "sampled-gradients":

@@ -43,7 +43,20 @@ STUDIES: Mapping[str, Study] = MappingProxyType(
         ),
         RIVALS: Study(
             title="All methods at equal cost",
-            methods=("cpdeform", "sculpt", "fixed", "random", "restarts", "bayesopt", "cma", "mppi", "sampled-gradients"),
+            methods=(
+                "cpdeform",
+                "sculpt",
+                "fixed",
+                "random",
+                "restarts",
+                "bayesopt",
+                "cma",
+                "mppi",
+                "sampled-gradients",
+                "sac",
+                "ppo",
+                "td3",
+            ),
             equal_cost=True,
         ),
     }

@@ -1,15 +1,16 @@
-"""Registers the searches and the command `cpdeform rl`."""
+"""Registers the searches, the learners and the command `cpdeform rl`."""
 
 from __future__ import annotations
 
 from cpdeform.core.hookspecs import PluginSpec, hookimpl
 
 SEARCHES = "cpdeform_baselines.searches"
+LEARNERS = "cpdeform_baselines.learners.stage"
 
 
 @hookimpl
 def cpdeform_strategies() -> list[PluginSpec]:
-    """Searches over contact plans."""
+    """Searches over contact plans, and learners."""
     return [
         PluginSpec(
             name="restarts",
@@ -36,6 +37,9 @@ def cpdeform_strategies() -> list[PluginSpec]:
             target=f"{SEARCHES}.sampled:StrategySampledGradients",
             summary="descent from the best of 64 random contacts and motions",
         ),
+        PluginSpec(name="sac", target=f"{LEARNERS}:StrategySoftActorCritic", summary="a policy learnt by SAC in each stage"),
+        PluginSpec(name="ppo", target=f"{LEARNERS}:StrategyProximalPolicy", summary="a policy learnt by PPO in each stage"),
+        PluginSpec(name="td3", target=f"{LEARNERS}:StrategyTwinDelayed", summary="a policy learnt by TD3 in each stage"),
     ]
 
 

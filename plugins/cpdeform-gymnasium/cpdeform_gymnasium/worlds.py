@@ -97,6 +97,8 @@ class Worlds:
         iou: Whether steps tell the IoU, which takes some milliseconds a world.
         scene: Changes of the task's scene, nested, as ``--set scene...`` takes them.
         simulator_options: Further keyword options of the simulator.
+        simulator: A simulator of the task's scene with room for B worlds, in place of one by name.
+        start: Where episodes begin, a single world; defaults to where the scene begins.
         registry: Where names are looked up; defaults to the installed plugins.
 
     Raises:
@@ -119,6 +121,8 @@ class Worlds:
         iou: bool = True,
         scene: Mapping[str, Any] | None = None,
         simulator_options: Mapping[str, Any] | None = None,
+        simulator: Simulator | None = None,
+        start: State | None = None,
         registry: Registry | None = None,
     ) -> None:
         if count < 1:
@@ -130,9 +134,14 @@ class Worlds:
         loaded = limited_task(loaded) if limits else loaded.model_copy(update={"limits": {}})
         self.task = changed_task(loaded, scene=scene)
         self.count, self.start_noise, self.iou = count, start_noise, iou
-        name = registry.resolve("simulator", backend, device=device)
-        options = {"batch_size": count, **(simulator_options or {})}
-        self.simulator: Simulator = registry.create("simulator", name, scene=self.task.scene, device=device, **options)
+        if simulator is None:
+            name = registry.resolve("simulator", backend, device=device)
+            options = {"batch_size": count, **(simulator_options or {})}
+            simulator = registry.create("simulator", name, scene=self.task.scene, device=device, **options)
+        elif simulator.scene != self.task.scene or simulator.batch_size < count:
+            came = f"room for {simulator.batch_size}" if simulator.scene == self.task.scene else "one of another scene"
+            raise InputError("simulator", came=came, expected=f"a simulator of the task's scene with room for {count} worlds")
+        self.simulator: Simulator = simulator
         goal = torch.as_tensor(self.task.load_goal()).to(device=self.simulator.device, dtype=self.simulator.dtype)
         self.goal = goal
         self.observation = Observation(self.task.scene, particles=observed_particles)
@@ -140,7 +149,8 @@ class Worlds:
         self._transport = MatchedTransport(self.task, goal, points=points)
         self._goal_grid = goal_mass_grid(self.task, goal.double())
         self._goal_iou = float(soft_iou(self._goal_grid, self._goal_grid))
-        self._template = self.simulator.initial_state(batch_size=1)
+        begun = self.simulator.initial_state(batch_size=1) if start is None else start
+        self._template = begun.to(device=self.simulator.device, dtype=self.simulator.dtype)
         self.state = self._template.fork(count)
         terms = self.reward.terms(self.state.position, self.state.tool_pose)
         self._start: Info = {key: value.detach().clone() for key, value in terms.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -51,18 +52,20 @@ class LearnerStableBaselines(Learner):
 
     Args:
         configuration: How.
-        out: Where TensorBoard's files go.
+        out: Where TensorBoard's files go; None for nowhere.
+        environment: Where it learns; defaults to that of the configuration.
 
     Raises:
         InputError: The algorithm does not take one of the options.
     """
 
-    def __init__(self, configuration: LearnerConfiguration, out: Path) -> None:
-        monitored: Any = VecMonitor(WorldsVecEnv(make_vector(configuration)), info_keywords=())
+    def __init__(self, configuration: LearnerConfiguration, out: Path | None, environment: WorldsVecEnv | None = None) -> None:
+        monitored: Any = VecMonitor(environment or WorldsVecEnv(make_vector(configuration)), info_keywords=())
         self._environment = VecNormalize(monitored)
         self._class = CLASSES[configuration.algorithm]
         self._configuration, self._out = configuration, out
-        options = {**_defaults(configuration), **configuration.options}
+        # Nested ones are written to by stable-baselines3.
+        options = {**_defaults(configuration), **copy.deepcopy(configuration.options)}
         try:
             self._model: Any = self._class(
                 "MlpPolicy", self._environment, seed=configuration.seed, device=configuration.device, **options
@@ -109,7 +112,8 @@ class LearnerStableBaselines(Learner):
         self._log()
 
     def _log(self) -> None:
-        self._model.set_logger(configure(str(self._out / "tensorboard"), ["tensorboard"]))
+        logger = configure(None, []) if self._out is None else configure(str(self._out / "tensorboard"), ["tensorboard"])
+        self._model.set_logger(logger)
 
 
 def _defaults(configuration: LearnerConfiguration) -> dict[str, Any]:
