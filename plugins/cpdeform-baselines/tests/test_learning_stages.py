@@ -18,7 +18,7 @@ from cpdeform_gymnasium.rewards import MatchedTransport
 
 NETWORK = {"policy_kwargs": {"net_arch": [8]}}
 OPTIONS = {"sac": {**NETWORK, "batch_size": 8}, "td3": {**NETWORK, "batch_size": 8}, "ppo": NETWORK}
-EPISODES = 24
+EPISODES = 12
 
 
 def run(task: Task, name: str, *, episodes: int = EPISODES, seed: int = 0) -> RunResult:
@@ -36,7 +36,7 @@ def test_a_run_costs_its_episodes_and_executes_what_lowers_the_loss(task: Task, 
     (candidate,) = stage.candidates
     assert candidate.actions.shape == (task.rollout_steps, task.scene.action_size)
     assert float(candidate.actions.abs().max()) <= 1.0
-    # Of two dozen random motions of a ball above a block some press it, as the goal asks for.
+    # Of a dozen random motions of a ball above a block some press it, as the goal asks for.
     assert stage.loss < stage.loss_before
     assert stage.loss == pytest.approx(candidate.loss, rel=1e-2)
     # The tool begins where the task puts it.
@@ -44,7 +44,7 @@ def test_a_run_costs_its_episodes_and_executes_what_lowers_the_loss(task: Task, 
 
 
 def test_a_seed_repeats_and_another_one_does_not(task: Task) -> None:
-    first, again, other = (run(task, "ppo", seed=seed).stages[0].candidates[0].actions for seed in (1, 1, 2))
+    first, again, other = (run(task, "ppo", episodes=4, seed=seed).stages[0].candidates[0].actions for seed in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
