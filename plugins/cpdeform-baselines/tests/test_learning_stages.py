@@ -107,6 +107,12 @@ def test_proximal_policy_pays_for_its_rollouts(steps: int, worlds: int) -> None:
     assert found["batch_size"] > 1
 
 
+def test_proximal_policy_spends_no_more_than_its_episodes(task: Task) -> None:
+    """Of 11 episodes of 4 steps in 8 worlds, rollouts of 16 steps: two, and no third one."""
+    (stage,) = run(task, "ppo", episodes=11).stages
+    assert stage.rollouts == 2 * 16 // task.step_count + 4
+
+
 @pytest.mark.parametrize(("options", "message"), [({"episodes": 0}, "episodes"), ({"learner": {"speed": 3}}, "options of sac")])
 def test_unusable_options(task: Task, options: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):

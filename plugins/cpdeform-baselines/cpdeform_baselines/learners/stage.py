@@ -114,7 +114,7 @@ class PhaseLearner(Phase):
         )
         learner = LearnerStableBaselines(configuration, None, vector)
         try:
-            learner.learn(configuration.steps, lambda *_: None)
+            learner.learn(_paid(configuration), lambda *_: None)
         finally:
             bench.rollouts += -(-learner.steps_done // length)
         policy, single = learner.policy(), _environment(bench, candidate, 1)
@@ -140,6 +140,12 @@ def _environment(bench: Workbench, candidate: Candidate, worlds: int) -> DeformV
         limits=False,
         iou=False,
     )
+
+
+def _paid(configuration: LearnerConfiguration) -> int:
+    """Steps of a training that the budget covers: PPO ends with the rollout in which it reaches its number of steps."""
+    each = int(configuration.options.get("n_steps", 1)) * configuration.worlds
+    return max(each, configuration.steps // each * each) if configuration.algorithm == "ppo" else configuration.steps
 
 
 def _rollouts(algorithm: Algorithm, steps: int, worlds: int) -> dict[str, int]:
