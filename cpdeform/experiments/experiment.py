@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from cpdeform.core.errors import InputError
+from cpdeform.core.errors import EngineError, InputError
 from cpdeform.experiments.experiment_job import do_experiment_run, experiment_jobs
 from cpdeform.experiments.experiment_plan import METHODS, TASKS, ExperimentSettings, PlannedRun
 from cpdeform.experiments.experiment_row import ExperimentRow, read_row
@@ -54,6 +54,7 @@ def run_experiment(
 
     Raises:
         InputError: Another command is at one of the runs, with other settings.
+        EngineError: The workers ended before a run was over.
     """
     jobs = experiment_jobs(settings, runs, resume=resume)
     queue = _queue(settings.out, [job for job, _ in jobs], threads=threads)
@@ -68,8 +69,10 @@ def run_experiment(
     for outcome in outcomes:
         yield _row(left.pop(outcome.name), outcome, settings)
     for name, run in left.items():
-        # Another command has done it meanwhile.
-        (content,) = (content for _, content in queue.outcomes([name]))
+        # Another command has done it meanwhile, or nobody has, where the workers were killed.
+        content = next((content for _, content in queue.outcomes([name])), None)
+        if content is None:
+            raise EngineError(f"the workers ended before {name} was over. The same command goes on where they were.")
         yield _row(run, Outcome(name=name, outcome=content.pop("outcome"), figures=content | {"reused": True}), settings)
 
 

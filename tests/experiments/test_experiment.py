@@ -308,3 +308,12 @@ def test_variants_of_tasks():
 )
 def test_directories_are_left_out(text, expected):
     assert without_directories(text) == expected
+
+
+def test_workers_that_were_killed_leave_a_word(copied, monkeypatch):
+    """Nobody has done the run that is left: one that another command had done would be there."""
+    monkeypatch.setattr("cpdeform.sweep.engines.local.EngineLocal.work", lambda *_: iter(()))
+    finished = run_toy("--seeds", "0,2", "--out", "out", "--workers", "2")
+    assert finished.exit_code == 2
+    assert "the workers ended before" in finished.stderr
+    assert "goes on where they were" in finished.stderr

@@ -31,6 +31,9 @@ EPISODES = 1_000
 WORLDS = 8
 """Worlds that are stepped together, at most."""
 
+JUDGED = 3
+"""Rollouts after the training: the policy's own episode, and its plan and the best episode's, by the stage's loss."""
+
 LEAST_UPDATES = 4
 """Updates of PPO, at least: where there are few steps, it learns from fewer of them at a time."""
 
@@ -85,7 +88,7 @@ class PhaseLearner(Phase):
 
     def effort(self, candidates: int) -> Effort:
         """See `Phase`; an episode costs a rollout, and the two plans are judged."""
-        return Effort(rollouts=(self.episodes + 3, self.episodes + 3))
+        return Effort(rollouts=(self.episodes + JUDGED, self.episodes + JUDGED))
 
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
         """The first candidate with the better of the two plans; the others are left out."""
