@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from cpdeform.core.task import Task, list_variants, read_task, task_path
 from cpdeform.run.checks.bodies import check_near_bodies, gap
 from cpdeform.run.checks.check import check_task, check_tools, warn_about_tools
 from cpdeform.run.checks.finding import Finding
-from cpdeform.run.checks.goal_height import check_goal_below_floor, check_goal_floating
+from cpdeform.run.checks.goal_height import check_goal_below_floor, check_goal_floating, check_goal_sunk
 from cpdeform.run.checks.goal_reach import check_goal_reach
 from cpdeform.run.checks.goal_rest import check_goal_rest
 from cpdeform.run.checks.goal_volume import check_goal_volume
@@ -262,6 +263,20 @@ def test_a_goal_below_the_floor_is_told_of_unless_clay_starts_there() -> None:
     assert check_goal_below_floor(scene, high, moved(goal, 0.0, 0.047, 0.0)) == []
 
 
+def test_a_goal_inside_the_floor_is_told_of_where_no_clay_starts() -> None:
+    scene, height = scene_with(ground_height=0.27), 20.0 / 64.0
+    clay = box_points((0.5, height - 1.5 / 64.0 + 0.05, 0.5), (0.2, 0.1, 0.2))
+    wide = box_points((0.5, height - 1.5 / 64.0 + 0.05, 0.5), (0.3, 0.1, 0.2))
+    finding = only(check_goal_sunk(scene, clay, wide))
+    assert finding.severity == "note"
+    # A third of the goal is beside the clay; of its height of 6.4 cells one is more than half a cell inside the layer.
+    share = int(re.match(r"(\d+)%", finding.what)[1])  # type: ignore[index]
+    assert share == pytest.approx(100.0 / 3.0 / 6.4, abs=1.5)
+    assert check_goal_sunk(scene, clay, clay) == []
+    up = 1.5 / 64.0
+    assert check_goal_sunk(scene, moved(clay, 0.0, up, 0.0), moved(wide, 0.0, up, 0.0)) == []
+
+
 def test_a_goal_out_of_reach_is_told_of(tmp_path: Path) -> None:
     ball = {"kind": "Sphere", "radius": 0.03, "action_scale": (0.01, 0.01, 0.01)}
     clay = sample_particles(scene_with(ball))
@@ -310,7 +325,9 @@ def test_the_tasks_that_come_with_it_have_no_fault(name: str) -> None:
         kinds = {"move": {"goal floating"}, "triple-move": {"goal floating"}, "table": {"near bodies"}}
         kinds["chopsticks"] = {"goal at rest"}  # the goal is held up by the chopsticks
         found = {finding.kind for finding in notes}
-        assert found - {"goal detail"} == kinds.get(name, set())
+        assert found - {"goal detail", "goal inside the floor"} == kinds.get(name, set())
+        # PlasticineLab's bodies begin at the domain's lower face, two cells inside the floor's boundary layer.
+        assert ("goal inside the floor" in found) == (name in {"chopsticks", "move++", "rope", "rope++"})
         # Some of the paper's goals are thin: ends of ropes, legs of a table.
         assert "goal detail" not in found or name in {"chopsticks", "rope", "rope++", "table"}
         with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""A goal that hangs in the air, or lies lower than clay can."""
+"""A goal that hangs in the air, lies lower than clay can, or where clay hardly gets down to."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ FLOATING_CELLS = 2.0
 """Grid cells between a goal's part and what carries it, from which on it counts as floating."""
 LEAST_PART = 0.02
 """Part of the goal's particles that is worth telling of."""
+
+SUNK_CELLS = 0.5
+"""Grid cells below where clay comes to rest, from which on a particle counts as one inside the floor's boundary layer."""
 
 
 def check_goal_floating(scene: Scene, goal: NDArray[np.float64]) -> list[Finding]:
@@ -72,6 +75,40 @@ def check_goal_below_floor(scene: Scene, clay: NDArray[np.float64], goal: NDArra
             "or start the bodies as low.",
         )
     ]
+
+
+def check_goal_sunk(scene: Scene, clay: NDArray[np.float64], goal: NDArray[np.float64]) -> list[Finding]:
+    """Tell of parts of a goal (M, 3) inside the floor's boundary layer where no clay (N, 3) starts below them, length units.
+
+    In this layer clay can rise but never sink. What is squeezed out sideways rises by chance and through thinning, and stays above
+    it, so that the lowest part of the goal is not filled. A body that is pushed along as a whole stays in the layer.
+    """
+    lowest = scene.resting_height - SUNK_CELLS * scene.node_distance
+    sunk = goal[goal[:, 1] < lowest]
+    if len(sunk) < LEAST_PART * len(goal):
+        return []
+    started = {tuple(column) for column in _columns(scene, clay[clay[:, 1] < lowest])}
+    share = sum(tuple(column) not in started for column in _columns(scene, sunk)) / len(goal)
+    if share < LEAST_PART:
+        return []
+    depth = scene.resting_height - float(np.percentile(sunk[:, 1], 1.0))
+    return [
+        Finding(
+            "note",
+            "goal inside the floor",
+            "goal",
+            f"{share:.0%} of the goal lies up to {depth:.3g} inside the floor's boundary layer where no clay starts: clay that is "
+            "squeezed there rises, and nothing sinks in this layer again.",
+            f"Lower the floor (ground_height), or raise bodies and goal by {depth:.3g}; keep it if bodies are pushed along as a "
+            "whole.",
+        )
+    ]
+
+
+def _columns(scene: Scene, positions: NDArray[np.float64]) -> list[list[int]]:
+    """The column of grid cells that each of some particles (N, 3) is in."""
+    columns: list[list[int]] = np.floor(positions[:, [0, 2]] / scene.node_distance).astype(int).tolist()
+    return columns
 
 
 def _near_fixed_tool(scene: Scene, particles: NDArray[np.float64], distance: float) -> bool:
