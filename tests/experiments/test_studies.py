@@ -168,7 +168,7 @@ def test_rivals_spend_what_the_reference_spent(folder):
     assert float(lines["fixed"]["w1_minus_reference"]) == pytest.approx(difference)
     spent = {name: float(line["cost"]) for name, line in lines.items()}
     assert spent["fixed"] == pytest.approx(spent["cpdeform"], rel=0.5)
-    assert "`cpdeform` is first on" in Path("out/summary.md").read_text()
+    assert "`cpdeform` is ahead of all rivals on" in Path("out/summary.md").read_text()
     assert known_shares(Path("out"))["shift"] > 0.0
 
 
