@@ -93,5 +93,11 @@ _TASKS = "`cpdeform tasks` lists them."
 
 
 def _show(result: ImportedGrid) -> None:
+    """Tell of an imported goal, and whether it lies lower than its task's clay gets, as where PlasticineLab's body begins lower."""
+    from cpdeform.core.sampling import sample_particles
+    from cpdeform.run.checks.goal_height import check_goal_below_floor
+
     figures = f"{len(result.position)} particles, error of the node masses {result.error:.2g}, {result.seconds:.1f} s"
     typer.echo(f"{result.path}: {result.name} for {result.task}, {figures}")
+    for finding in check_goal_below_floor(result.scene, sample_particles(result.scene), result.position):
+        typer.echo(f"{finding.severity}: {finding.kind}: {finding}")

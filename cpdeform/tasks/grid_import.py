@@ -67,6 +67,7 @@ class ImportedGrid:
         grid: Node masses (G, G, G), mass units, scaled to the mass of N particles.
         error: Relative error sum |m - m*| / sum m* of the particles' own node masses m.
         seconds: Wall time.
+        scene: Scene that it is for.
     """
 
     name: str
@@ -76,6 +77,7 @@ class ImportedGrid:
     grid: NDArray[np.float64]
     error: float
     seconds: float
+    scene: Scene
 
 
 def read_grids(path: Path, *, limits: ReadingLimits | None = None) -> dict[str, NDArray[np.float64]]:
@@ -193,7 +195,7 @@ def import_grid(
         except OSError as problem:
             came = f"a path that cannot be written ({problem.strerror or problem})"
             raise InputError(f"goal file {path}", came=came, expected="a writable path") from problem
-    return ImportedGrid(name, task.name, path, stored, scaled, error, time.perf_counter() - began)
+    return ImportedGrid(name, task.name, path, stored, scaled, error, time.perf_counter() - began, task.scene)
 
 
 def import_grids(
