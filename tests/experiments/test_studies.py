@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from cpdeform.cli.main import app
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.task import load_task
-from cpdeform.experiments.studies import equal_cost
+from cpdeform.experiments.studies import equal_cost, rivals
 from cpdeform.experiments.studies.equal_cost import JUDGED, budget_values, known_shares, rollout_share
 from cpdeform.experiments.studies.statistics import Interval, mean, rank_correlation
 from cpdeform.experiments.studies.study import PRESETS, STUDIES
@@ -159,7 +159,8 @@ def test_runtimes_are_those_of_the_stages(folder):
     assert found == pytest.approx(np.cumsum([0.0, *(stage.seconds["total"] for stage in record.stages)]))
 
 
-def test_rivals_spend_what_the_reference_spent(folder):
+def test_rivals_spend_what_the_reference_spent(folder, monkeypatch):
+    monkeypatch.setattr(rivals, "OWN", ("cpdeform", "random"))
     finished = experiment("rivals", *RUNS, "--out", "out")
     assert finished.exit_code == 0, finished.output
     lines = {line["method"]: line for line in values("out")}
@@ -168,7 +169,13 @@ def test_rivals_spend_what_the_reference_spent(folder):
     assert float(lines["fixed"]["w1_minus_reference"]) == pytest.approx(difference)
     spent = {name: float(line["cost"]) for name, line in lines.items()}
     assert spent["fixed"] == pytest.approx(spent["cpdeform"], rel=0.5)
-    assert "`cpdeform` is ahead of all rivals on" in Path("out/summary.md").read_text()
+    text = Path("out/summary.md").read_text()
+    for own in ("cpdeform", "random"):
+        assert f"`{own}` is ahead of all rivals on" in text
+        ahead = float(lines[own]["w1_final"]) < float(lines["fixed"]["w1_final"])
+        behind = mean([float(lines["fixed"]["w1_final"]) - float(lines[own]["w1_final"])])
+        _, verdict = text.split(f"its W1 minus that of {own}, same seeds |")
+        assert verdict.splitlines()[2].startswith(f"| shift | {'yes' if ahead else 'no'} | fixed | {behind.value:.4f}")
     assert known_shares(Path("out"))["shift"] > 0.0
 
 

@@ -47,11 +47,9 @@ def summarize(runs: Sequence[StudyRun], shares: Mapping[str, float]) -> Summary:
 
 def _values(runs: Sequence[StudyRun], task: str, method: str, share: float) -> dict[str, Any]:
     own = [run for run in chosen(runs, task, method) if run.row.over]
-    reference = {run.row.seed: run for run in chosen(runs, task, REFERENCE) if run.row.over}
     final = final_distance(runs, task, method)
-    pairs = [(run, reference[run.row.seed]) for run in own if run.row.seed in reference]
     difference = _difference(runs, task, method, REFERENCE)
-    ratio = mean([_ratio_within(run, _seconds(other)) for run, other in pairs])
+    ratio = mean([_ratio_within(run, _seconds(other)) for run, other in _pairs(runs, task, method, REFERENCE)])
     line: dict[str, Any] = {"task": task, "method": method, "seeds": final.count, "rollout_share": share}
     intervals = {"w1_final": final, "w1_minus_reference": difference, "loss_ratio_in_seconds": ratio}
     intervals["cost"] = mean([_cost(run, share) for run in own])
@@ -135,9 +133,13 @@ def _verdict_of(
 
 def _difference(runs: Sequence[StudyRun], task: str, method: str, other: str) -> Interval:
     """W1 of a method minus that of another one, in the mean of the seeds that both have."""
+    return mean([_final(run) - _final(same) for run, same in _pairs(runs, task, method, other)])
+
+
+def _pairs(runs: Sequence[StudyRun], task: str, method: str, other: str) -> list[tuple[StudyRun, StudyRun]]:
+    """Runs of two methods that are over, with the same seeds."""
     found = {run.row.seed: run for run in chosen(runs, task, other) if run.row.over}
-    pairs = [(run, found[run.row.seed]) for run in chosen(runs, task, method) if run.row.over and run.row.seed in found]
-    return mean([_final(run) - _final(same) for run, same in pairs])
+    return [(run, found[run.row.seed]) for run in chosen(runs, task, method) if run.row.over and run.row.seed in found]
 
 
 def _seconds_table(tasks: Sequence[str], methods: Sequence[str], found: Mapping[tuple[str, str], Mapping[str, Any]]) -> str:
