@@ -24,7 +24,7 @@ from cpdeform.core.task import Task, list_variants, read_task, task_path
 from cpdeform.run.checks.bodies import check_near_bodies, gap
 from cpdeform.run.checks.check import check_task, check_tools, warn_about_tools
 from cpdeform.run.checks.finding import Finding
-from cpdeform.run.checks.goal_height import check_goal_below_floor, check_goal_floating, check_goal_sunk
+from cpdeform.run.checks.goal_height import check_goal_below_floor, check_goal_floating, check_goal_inside_floor
 from cpdeform.run.checks.goal_reach import check_goal_reach
 from cpdeform.run.checks.goal_rest import check_goal_rest
 from cpdeform.run.checks.goal_volume import check_goal_volume
@@ -267,14 +267,14 @@ def test_a_goal_inside_the_floor_is_told_of_where_no_clay_starts() -> None:
     scene, height = scene_with(ground_height=0.27), 20.0 / 64.0
     clay = box_points((0.5, height - 1.5 / 64.0 + 0.05, 0.5), (0.2, 0.1, 0.2))
     wide = box_points((0.5, height - 1.5 / 64.0 + 0.05, 0.5), (0.3, 0.1, 0.2))
-    finding = only(check_goal_sunk(scene, clay, wide))
+    finding = only(check_goal_inside_floor(scene, clay, wide))
     assert finding.severity == "note"
     # A third of the goal is beside the clay; of its height of 6.4 cells one is more than half a cell inside the layer.
     share = int(re.match(r"(\d+)%", finding.what)[1])  # type: ignore[index]
     assert share == pytest.approx(100.0 / 3.0 / 6.4, abs=1.5)
-    assert check_goal_sunk(scene, clay, clay) == []
+    assert check_goal_inside_floor(scene, clay, clay) == []
     up = 1.5 / 64.0
-    assert check_goal_sunk(scene, moved(clay, 0.0, up, 0.0), moved(wide, 0.0, up, 0.0)) == []
+    assert check_goal_inside_floor(scene, moved(clay, 0.0, up, 0.0), moved(wide, 0.0, up, 0.0)) == []
 
 
 def test_a_goal_out_of_reach_is_told_of(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from cpdeform.core.task import Task, limited_task
 from cpdeform.run.checks.bodies import check_near_bodies
 from cpdeform.run.checks.finding import Finding
 from cpdeform.run.checks.goal_detail import check_goal_detail
-from cpdeform.run.checks.goal_height import check_goal_below_floor, check_goal_floating, check_goal_sunk
+from cpdeform.run.checks.goal_height import check_goal_below_floor, check_goal_floating, check_goal_inside_floor
 from cpdeform.run.checks.goal_reach import check_goal_reach
 from cpdeform.run.checks.goal_rest import check_goal_rest
 from cpdeform.run.checks.goal_volume import check_goal_volume
@@ -46,7 +46,7 @@ def check_task(task: Task) -> list[Finding]:
         *floating,
         *([] if floating else check_goal_rest(task.scene, goal)),
         *check_goal_below_floor(task.scene, clay, goal),
-        *check_goal_sunk(task.scene, clay, goal),
+        *check_goal_inside_floor(task.scene, clay, goal),
         *check_goal_reach(task, clay, goal),
         *check_goal_detail(task.scene, goal),
     ]

@@ -17,7 +17,7 @@ FLOATING_CELLS = 2.0
 LEAST_PART = 0.02
 """Part of the goal's particles that is worth telling of."""
 
-SUNK_CELLS = 0.5
+INSIDE_CELLS = 0.5
 """Grid cells below where clay comes to rest, from which on a particle counts as one inside the floor's boundary layer."""
 
 
@@ -77,13 +77,14 @@ def check_goal_below_floor(scene: Scene, clay: NDArray[np.float64], goal: NDArra
     ]
 
 
-def check_goal_sunk(scene: Scene, clay: NDArray[np.float64], goal: NDArray[np.float64]) -> list[Finding]:
-    """Tell of parts of a goal (M, 3) inside the floor's boundary layer where no clay (N, 3) starts below them, length units.
+def check_goal_inside_floor(scene: Scene, clay: NDArray[np.float64], goal: NDArray[np.float64]) -> list[Finding]:
+    """Tell of parts of a goal (M, 3) inside the floor's boundary layer, in columns of cells where no clay (N, 3) starts as low.
 
-    In this layer clay can rise but never sink. What is squeezed out sideways rises by chance and through thinning, and stays above
-    it, so that the lowest part of the goal is not filled. A body that is pushed along as a whole stays in the layer.
+    In this layer clay can rise but never sink. What is squeezed out sideways rises as it thins and stays above the layer, so that
+    the lowest part of the goal is not filled. A body that is pushed along as a whole stays in the layer. Positions are in length
+    units.
     """
-    lowest = scene.resting_height - SUNK_CELLS * scene.node_distance
+    lowest = scene.resting_height - INSIDE_CELLS * scene.node_distance
     sunk = goal[goal[:, 1] < lowest]
     if len(sunk) < LEAST_PART * len(goal):
         return []
