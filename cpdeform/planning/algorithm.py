@@ -46,6 +46,8 @@ class Start:
         first_stage: Number of the first stage.
         stages: Number of stages.
         previous: The stages before the first one, of a run that goes on.
+        continued: Whether the run goes on as it began, with the same parts and settings: what comes of it is then to equal what a
+            run that went through comes to, and a loop may revise the stages before.
     """
 
     state: State
@@ -53,6 +55,7 @@ class Start:
     first_stage: int
     stages: int
     previous: tuple[StageResult, ...] = ()
+    continued: bool = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -122,6 +125,7 @@ class Planner:
         state: State | None = None,
         first_stage: int = 0,
         previous: Sequence[StageResult] = (),
+        continued: bool = False,
     ) -> DeformResult:
         """Run Algorithm 1.
 
@@ -131,9 +135,11 @@ class Planner:
             first_stage: Number of the first stage: of one that goes on from a record, `RunRecord.next_stage`. With the seed it
                 determines the random numbers, so that a run that is resumed equals one that went through.
             previous: The stages before the first one, of a run that goes on: contact points that failed there are not tried again.
+            continued: Whether these were made with the same parts and settings; see `Start`.
 
         Returns:
-            Every stage, and how the run ended. A stage that fails ends the run; what came before is kept.
+            Every stage, those before where they were revised, and how the run ended. A stage that fails ends the run; what came
+            before is kept.
 
         Raises:
             CapabilityError: The parts do not fit together.
@@ -155,7 +161,7 @@ class Planner:
         goal = torch.as_tensor(self.task.load_goal()).to(device=self.simulator.device, dtype=self.simulator.dtype)
         for observer in self.observers:
             observer.run_started(self.task, goal, self.names, self.seed)
-        start = Start(state=state, goal=goal, first_stage=first_stage, stages=count, previous=tuple(previous))
+        start = Start(state=state, goal=goal, first_stage=first_stage, stages=count, previous=tuple(previous), continued=continued)
         results = self._follow(start)
         metric = evaluate_metric(self.task, start=scene_start.position[0], final=results[-1].state.position[0], goal=goal)
         finished = DeformResult(
@@ -277,6 +283,12 @@ class Planner:
             warm=found.warm,
         )
 
+    def warm_at(self, start: Start) -> tuple[object, ...] | None:
+        """What the objective can start from at the start of a run that goes on, as its last stage would have told."""
+        if not (start.continued and start.previous):
+            return None
+        return self.objective.evaluate(still_trajectory(start.state, self.task.rollout_steps, scene=self.task.scene)).warm
+
     def _workbench(
         self, start: Start, index: int, state: State, before: Sequence[StageResult], warm: tuple[object, ...] | None
     ) -> Workbench:
@@ -374,7 +386,7 @@ def contact_points_discovery(planner: Planner, start: Start) -> Iterator[StageRe
         The result of each stage, as soon as it is known; that of an interrupted one before the interruption goes on.
     """
     results: list[StageResult] = []
-    state, warm = start.state, None
+    state, warm = start.state, planner.warm_at(start)
     # "for each stage:"
     for index in range(start.first_stage, start.first_stage + start.stages):
         try:

@@ -151,7 +151,8 @@ def _execute(planner: Planner, planned: Sequence[StageResult], plan: Tensor) -> 
 
 
 def _idle_after(result: StageResult, before: Sequence[StageResult]) -> StageResult:
-    """A stage without a plan, where the stages before it may have ended elsewhere."""
+    """A stage without a plan, where the stages before it may have ended elsewhere; it took no part, and says so."""
+    result = dataclasses.replace(result, seconds={PHASE: 0.0, **result.seconds})
     if not before:
         return result
     last = before[-1]

@@ -101,12 +101,15 @@ class Revision:
     """Stages that a loop has given already, with other plans.
 
     Attributes:
-        results: The stages as they are now, in order, up to the last one that was given.
+        results: The stages as they are now, in order, up to the last one that was given. The first ones may be older than the run
+            that revises them, where it goes on with a recorded one.
         reason: What changed them, e.g. ``"joint polish"``.
+        complete: Whether this is all that was to come of it; False where it was interrupted.
     """
 
     results: tuple[StageResult, ...]
     reason: str
+    complete: bool = True
 
 
 @dataclasses.dataclass(frozen=True)

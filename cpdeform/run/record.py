@@ -6,15 +6,19 @@
     stage then has that status, too, if it had a plan, and its state is that after the best plan so far. ``memory``: estimate
     and measured peak of the rollouts and gradients of the largest batch, bytes. ``resumed_from``: the record that the run
     went on from, or null; its stages go on counting, so that the first file is that of the stage after the other record's
-    last one.
+    last one, or of an earlier one that was revised.
 ``metrics.jsonl``
     A JSON object a line: ``"kind": "iteration"`` for each gradient evaluation, ``"kind": "stage"`` for each stage,
-    ``"kind": "revision"`` where several stages up to that one got other plans, which their files then hold. ``time``
-    is when an iteration was done (Unix seconds), ``gradient_norm`` that of its gradient by the actions.
+    ``"kind": "revision"`` where several stages up to that one got other plans, which their files then hold; ``complete`` is
+    false where that was interrupted. ``time`` is when an iteration was done (Unix seconds), ``gradient_norm`` that of its
+    gradient by the actions.
 ``.run.lock``
     Number of the process that writes, while it does.
 ``goal.h5``, ``stage-000.h5``, ...
     The goal, and each finished stage; the attributes of every dataset say what it holds.
+``unrevised-000.h5``, ...
+    Stages as they were before the last revision, until the next stage is finished: where the revision broke off, a run that goes
+    on in this directory begins there.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ import contextlib
 import datetime
 import errno
 import json
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -45,9 +50,12 @@ from cpdeform.run.record_files import (
     check_directory,
     environment,
     own_files,
+    replacing,
     replacing_hdf5,
     stage_file,
     to_json,
+    unrevised_file,
+    unrevised_files,
     write_dataset,
     write_json,
 )
@@ -203,19 +211,46 @@ class RunRecorder(Observer):
         self._rescued = result.status is Status.INTERRUPTED
         with self._writing():
             write_stage(self.directory / stage_file(result.index), result)
+            self._forget_unrevised()
             self._run["stages_finished"] += result.status.executed
             self._write_run()
 
     def stages_revised(self, revision: Revision) -> None:
-        """Write the stages' files anew, the last one first: it is where a run that goes on begins."""
+        """Write the stages' files anew, the last one first: it is where a run that goes on begins.
+
+        Those of before are kept beside them until the next stage is finished, for a run that breaks off and is to go on as if it
+        had not.
+        """
+        with self._writing():
+            for result in revision.results:
+                self._keep_unrevised(result.index)
         for result in reversed(revision.results):
             with self._writing():
                 write_stage(self.directory / stage_file(result.index), result)
         last = revision.results[-1]
-        self._append({"kind": "revision", "stage": last.index, "stages": len(revision.results), "loss": last.loss})
+        line = {"kind": "revision", "stage": last.index, "stages": len(revision.results), "loss": last.loss}
+        self._append({**line, "complete": revision.complete})
+        with self._writing():
+            # A run that goes on with another record may have revised stages of that one.
+            self._run["stages_finished"] = max(
+                self._run["stages_finished"], sum(result.status.executed for result in revision.results)
+            )
+            self._write_run()
+
+    def _forget_unrevised(self) -> None:
+        for path in unrevised_files(self.directory).values():
+            path.unlink()
+
+    def _keep_unrevised(self, index: int) -> None:
+        path = self.directory / stage_file(index)
+        if path.exists():
+            with replacing(self.directory / unrevised_file(index)) as temporary:
+                shutil.copyfile(path, temporary)
 
     def run_finished(self, result: DeformResult) -> None:
         """Complete the record."""
+        with self._writing():
+            self._forget_unrevised()
         self._finish(
             status=result.status.value,
             advice=result.status.advice,

@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 from cpdeform.core.task import Task
 from cpdeform.planning.result import DeformResult, Status
 from cpdeform.run.record import RunRecorder
-from cpdeform.run.record_files import METRICS_FILE, replacing, stage_file, stage_files, to_json
-from cpdeform.run.record_reader import RunRecord, load_record
+from cpdeform.run.record_files import (
+    METRICS_FILE,
+    replacing,
+    stage_file,
+    stage_files,
+    to_json,
+    unrevised_file,
+    unrevised_files,
+)
+from cpdeform.run.record_reader import RunRecord, load_record, with_unrevised_stages
+from cpdeform.run.record_stage import write_stage
 from cpdeform.run.resume import recorded_configuration
 
 
@@ -30,9 +41,32 @@ def broken_off(directory: Path) -> RunRecord | None:
     """
     record = load_record(directory)
     planned = recorded_configuration(record).stages or record.task.stage_count
-    # The plan of an interrupted stage is not the one that it would have come to; and the end of a run comes with its last stage.
-    stages = tuple(stage for stage in record.stages if stage.status is Status.FINISHED)[: planned - 1]
-    return dataclasses.replace(record, stages=stages) if stages else None
+    numbers = {stage.index for stage in record.stages}
+    revised = max((line["stage"] for line in record.metrics if _is_revision(line) and line.get("stage") in numbers), default=-1)
+    copies = unrevised_files(directory)
+    if copies and (max(copies) > revised or len(numbers) == planned):
+        # The revision broke off, or the run did before it could say that it was its end.
+        record = with_unrevised_stages(record)
+    # The end of a run comes with its last stage.
+    stages = list(record.stages[: planned - 1])
+    # The plan of an interrupted stage is not the one that it would have come to; and one without a plan may be a run's last one.
+    while stages and stages[-1].status is not Status.FINISHED and stages[-1].index > revised:
+        del stages[-1]
+    if not stages:
+        return None
+    return dataclasses.replace(record, stages=tuple(stages), metrics=_lines_up_to(record.metrics, stages[-1].index))
+
+
+def _is_revision(line: Mapping[str, Any]) -> bool:
+    """Whether a line of the metrics tells of a revision that was complete."""
+    return line.get("kind") == "revision" and bool(line.get("complete", True))
+
+
+def _lines_up_to(metrics: Sequence[Mapping[str, Any]], last: int) -> tuple[dict[str, Any], ...]:
+    """The lines of the stages up to a certain one, without those of a revision that broke off after it."""
+    lines = [dict(line) for line in metrics if line.get("stage") in range(last + 1)]
+    ends = [number for number, line in enumerate(lines) if line.get("kind") == "stage" or _is_revision(line)]
+    return tuple(lines[: ends[-1] + 1]) if ends else ()
 
 
 class RunContinuer(RunRecorder):
@@ -52,11 +86,18 @@ class RunContinuer(RunRecorder):
     def run_started(self, task: Task, goal: Tensor, names: dict[str, str], seed: int) -> None:
         """Go on with the record; what is left of the stage that broke off is removed."""
         kept = {stage.index for stage in self._record.stages}
+        lines = [json.dumps(to_json(line)) for line in self._record.metrics]
+        for line in self._record.metrics:
+            if isinstance(number := line.get("batch"), int):
+                self._batch[line["stage"]] = max(self._batch.get(line["stage"], -1), number)
         with self._writing():
             self._lock.acquire()
+            for stage in self._record.stages:
+                if (self.directory / unrevised_file(stage.index)).exists():
+                    write_stage(self.directory / stage_file(stage.index), stage)
+            self._forget_unrevised()
             for path in set(stage_files(self.directory)) - {self.directory / stage_file(index) for index in kept}:
                 path.unlink()
-            lines = [json.dumps(to_json(line)) for line in self._record.metrics if line.get("stage") in kept]
             with replacing(self.directory / METRICS_FILE) as temporary:
                 temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
             self._run = {**self._record.run, "status": "running", "advice": "", "stages_finished": self._record.finished_stages}
@@ -64,13 +105,13 @@ class RunContinuer(RunRecorder):
 
     def run_finished(self, result: DeformResult) -> None:
         """Complete the record, as if the run had gone through."""
-        earlier = self._record.stages
+        earlier = [stage for stage in self._record.stages if stage.index < result.stages[0].index]
         super().run_finished(
             dataclasses.replace(
                 result,
-                loss_initial=earlier[0].loss_before,
+                loss_initial=(*earlier, *result.stages)[0].loss_before,
                 gradient_evaluations=result.gradient_evaluations + sum(stage.gradient_evaluations for stage in earlier),
                 rollouts=result.rollouts + sum(stage.rollouts for stage in earlier),
-                seconds=result.seconds + sum(stage.seconds.get("total", 0.0) for stage in earlier),
+                seconds=result.seconds + sum(stage.seconds.get("total", 0.0) for stage in self._record.stages),
             )
         )

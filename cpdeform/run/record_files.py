@@ -27,6 +27,7 @@ OLD_GOAL_FILE = "target.h5"
 """What it was called up to format 2."""
 
 STAGE_PATTERN = re.compile(r"stage-(\d{3,})\.h5")
+UNREVISED_PATTERN = re.compile(r"unrevised-(\d{3,})\.h5")
 SHAPE_PATTERN = re.compile(r"shape-[0-9a-f]{16}\.npz")
 PICTURE_FILES = ("picture.png", "sheet.png", "curves.png", "animation.mp4", "animation.gif", "report.html")
 OWN_FILES = (RUN_FILE, METRICS_FILE, GOAL_FILE, OLD_GOAL_FILE, *PICTURE_FILES)
@@ -45,6 +46,17 @@ def stage_files(directory: Path) -> list[Path]:
     return sorted(path for path in directory.iterdir() if STAGE_PATTERN.fullmatch(path.name))
 
 
+def unrevised_file(index: int) -> str:
+    """Name of the copy of a stage's file that is kept until a revision of it is complete."""
+    return f"unrevised-{index:03d}.h5"
+
+
+def unrevised_files(directory: Path) -> dict[int, Path]:
+    """Copies of stages' files that a revision which broke off has left, by the numbers of the stages."""
+    found = [(UNREVISED_PATTERN.fullmatch(path.name), path) for path in directory.iterdir()]
+    return {int(match[1]): path for match, path in sorted(found, key=lambda pair: pair[1]) if match}
+
+
 def own_files(directory: Path) -> list[Path]:
     """Files in a directory that belong to a run record, left-over temporary ones included."""
     return sorted(path for path in directory.iterdir() if (path.is_file() or path.is_symlink()) and _is_own(path.name))
@@ -52,7 +64,7 @@ def own_files(directory: Path) -> list[Path]:
 
 def _is_own(name: str) -> bool:
     plain = name[1:].replace(".tmp.", ".") if name.startswith(".") else name
-    return plain in OWN_FILES or any(pattern.fullmatch(plain) for pattern in (STAGE_PATTERN, SHAPE_PATTERN))
+    return plain in OWN_FILES or any(pattern.fullmatch(plain) for pattern in (STAGE_PATTERN, UNREVISED_PATTERN, SHAPE_PATTERN))
 
 
 ATTEMPTS_TO_WRITE = 10

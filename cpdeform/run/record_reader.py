@@ -21,7 +21,7 @@ from cpdeform.core.state import State
 from cpdeform.core.task import Task, beside
 from cpdeform.planning.result import StageResult
 from cpdeform.run.migration import current_task, goal_file
-from cpdeform.run.record_files import METRICS_FILE, RUN_FILE, stage_files
+from cpdeform.run.record_files import METRICS_FILE, RUN_FILE, stage_files, unrevised_files
 from cpdeform.run.record_stage import read_stage
 
 MOST_FORMAT = 1000
@@ -67,6 +67,12 @@ class RunRecord:
         return sum(stage.status.executed for stage in self.stages)
 
     @property
+    def first_stage(self) -> int:
+        """Number of the stage that the run began with: 0, or that after the record which it went on from."""
+        stages = (self.run.get("resumed_from") or {}).get("stages", 0)
+        return stages if isinstance(stages, int) else 0
+
+    @property
     def next_stage(self) -> int:
         """Number of the stage that a run going on from here begins with."""
         return self.stages[-1].index + 1 if self.stages else 0
@@ -109,13 +115,28 @@ def load_record(directory: Path | str, *, limits: ReadingLimits | None = None) -
         expected = "the goal of a run record"
         with open_arrays(own, argument=f"{argument}: {own.name}", expected=expected, limits=limits) as file:
             goal = torch.from_numpy(file.read("position", shape=("M", 3), kinds="f", meaning="positions"))
-        scene = task.scene
-        sizes = {"N": scene.particle_count, "M": len(scene.tools), "A": scene.action_size}
-        stages = tuple(
-            read_stage(path, argument=f"{argument}: {path.name}", sizes=sizes, limits=limits) for path in stage_files(directory)
-        )
+        stages = tuple(_read_stage(path, task, limits) for path in stage_files(directory))
         metrics = tuple(read_json_lines(directory / METRICS_FILE, argument=f"{argument}: {METRICS_FILE}", limits=limits))
     return RunRecord(directory, run, task, goal, metrics, stages)
+
+
+def with_unrevised_stages(record: RunRecord) -> RunRecord:
+    """A record with its stages as they were before a revision that broke off; the record itself where there was none.
+
+    Raises:
+        InputError: A file is damaged or too large.
+    """
+    files = unrevised_files(record.directory)
+    with boundary(f"run record {record.directory}", expected="the files of a run record"):
+        before = {index: _read_stage(path, record.task, _limits(record.task)) for index, path in files.items()}
+    stages = tuple(before.get(stage.index, stage) for stage in record.stages)
+    return dataclasses.replace(record, stages=stages) if before else record
+
+
+def _read_stage(path: Path, task: Task, limits: ReadingLimits) -> StageResult:
+    scene = task.scene
+    sizes = {"N": scene.particle_count, "M": len(scene.tools), "A": scene.action_size}
+    return read_stage(path, argument=f"run record {path.parent}: {path.name}", sizes=sizes, limits=limits)
 
 
 def _limits(task: Task) -> ReadingLimits:

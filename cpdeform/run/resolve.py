@@ -45,6 +45,7 @@ from cpdeform.run.parts import (
 from cpdeform.run.record_reader import RunRecord
 from cpdeform.run.result import RunResult
 from cpdeform.run.resume import check_same_task, resumed_task, resumed_values
+from cpdeform.run.same_run import same_settings
 from cpdeform.run.strategy_choice import choose_strategy
 from cpdeform.run.unused_options import warn_about_optimizer
 
@@ -90,6 +91,7 @@ class ResolvedRun:
         state: Where to start, a single world; None for the scene's start.
         first_stage: Number of the first stage.
         previous: The stages before it.
+        continued: Whether these were made with the same parts and settings.
         origins: Where each value of the configuration comes from, see `cpdeform.run.origins`.
     """
 
@@ -102,6 +104,7 @@ class ResolvedRun:
     state: State | None = None
     first_stage: int = 0
     previous: tuple[StageResult, ...] = ()
+    continued: bool = False
     origins: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
@@ -230,7 +233,11 @@ class ResolvedRun:
                 told = _Estimating(lambda: on_estimate(self._estimate_or_none(planner)))
                 planner = dataclasses.replace(planner, observers=(*planner.observers, told))
             found = planner.run(
-                stages=self.configuration.stages, state=self.state, first_stage=self.first_stage, previous=self.previous
+                stages=self.configuration.stages,
+                state=self.state,
+                first_stage=self.first_stage,
+                previous=self.previous,
+                continued=self.continued,
             )
         fields = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
         return RunResult(**fields, configuration=self.configuration, resumed_from=self.record, origins=self.origins)
@@ -311,6 +318,7 @@ def resolve(
         state=state if record is None else record.state,
         first_stage=first_stage if record is None else record.next_stage,
         previous=() if record is None else record.stages,
+        continued=record is not None and same_settings(record, configuration, task),
         origins=_origins(configuration, layers, asked, objects),
     )
 

@@ -46,7 +46,7 @@ def resumed_values(record: RunRecord, changes: Mapping[str, Any]) -> dict[str, A
         if part in changes and changes[part] != base[part]:
             base = {field: value for field, value in base.items() if field not in fields}
     planned = base["stages"] or record.task.stage_count
-    base["stages"] = max(planned - record.finished_stages, 1)
+    base["stages"] = max(record.first_stage + planned - record.next_stage, 1)
     return merge(base, changes)
 
 

@@ -30,6 +30,18 @@ def same_run(record: RunRecord, configuration: RunConfiguration, task: Task) -> 
     return _same_configuration(record, configuration) and _same_task(record, configuration, task)
 
 
+def same_settings(record: RunRecord, configuration: RunConfiguration, task: Task) -> bool:
+    """Whether a run that goes on from a record does so with the same scene, parts and settings, whatever its number of stages.
+
+    Args:
+        record: The record.
+        configuration: That of the run that goes on, names resolved.
+        task: Its task, the record's with the configuration's changes.
+    """
+    same = _same_configuration(record, configuration)
+    return same and (record.task.step_count, record.task.rest_steps) == (task.step_count, task.rest_steps)
+
+
 def _same_configuration(record: RunRecord, configuration: RunConfiguration) -> bool:
     apart = {"task", "goal", "stages", "workers", "executor", "executor_options"}
     recorded = recorded_configuration(record).model_dump(mode="json", exclude=apart)

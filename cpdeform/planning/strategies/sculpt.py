@@ -30,6 +30,7 @@ from cpdeform.planning.pruner import PrunerNone
 from cpdeform.planning.rest import rest, settle_goal
 from cpdeform.planning.result import Revision, StageResult, Status
 from cpdeform.planning.strategy import Parts, Strategy
+from cpdeform.planning.taken_up import taken_up
 
 MOST_CELLS, LEAST_SELF_IOU = 1.0, 0.9
 """How far a goal may fall and how much of its shape it has to keep to count as one at rest that hangs a little."""
@@ -86,12 +87,12 @@ class StrategySculpt(Strategy):
         *,
         touches: int = 96,
         variations: int = 32,
-        polished: tuple[int, int] = (10, 2),
-        iterations: tuple[int, int] = (4, 8),
+        polished: tuple[int, int] = (4, 1),
+        iterations: tuple[int, int] = (4, 6),
         together: int = 12,
         joint_gradients: int = 960,
         joint_every: int = 3,
-        interim_gradients: int = 120,
+        interim_gradients: int = 240,
         coarse: bool = True,
         idle: int = 3,
     ) -> None:
@@ -157,27 +158,49 @@ class StrategySculpt(Strategy):
         planner, start = from_rest(planner, start)
         if self.coarse:
             planner = screened_coarsely(planner)
+        before = taken_up(planner, start)
+        if before:
+            start = dataclasses.replace(start, previous=())
         finished: list[StageResult] = []
-        end = start.first_stage + start.stages
+        first, end = start.first_stage - len(before), start.first_stage + start.stages
         # Of the stages before the last joint descent that brought a gain it no longer counts that they had none.
-        counted = 0
-        for stages in _parts(range(start.first_stage, end), self.together):
-            held: list[StageResult] = []
-            while len(held) < len(stages):
-                for result in self._touches(planner, start, self._next(stages, len(held)), [*finished, *held], counted):
+        counted = self._counted(before)
+        for stages in _parts(range(first, end), self.together):
+            held = before[stages.start - first : stages.stop - first]
+            due = self._is_due(held, finished, stages, counted)
+            while due or len(held) < len(stages):
+                rest = range(0) if due else self._next(stages, len(held))
+                for result in self._touches(planner, start, rest, [*finished, *held], counted):
                     held.append(result)
                     yield result
-                over = self._is_over([*finished, *held], counted)
+                due, over = False, self._is_over([*finished, *held], counted)
                 last = over or len(held) == len(stages)
-                first = held[-1].loss
+                loss = held[-1].loss
                 for revision in self._polished(planner, held, self._joint if last else self._interim):
                     held = list(revision.results)
                     yield revision
-                if over and (held[-1].status is Status.NON_FINITE or first - held[-1].loss < WORTH_GOING_ON * first):
+                if over and (held[-1].status is Status.NON_FINITE or loss - held[-1].loss < WORTH_GOING_ON * loss):
                     return
                 if over:
                     counted = len(finished) + len(held)
             finished += held
+
+    def _counted(self, before: Sequence[StageResult]) -> int:
+        """The stages of a run that goes on before the last joint descent that let it go on although they had no gain."""
+        counted = 0
+        for done in range(1, len(before) + 1):
+            went_on = done < len(before) or JOINT_POLISH in before[-1].seconds
+            if went_on and self._is_over(before[:done], counted):
+                counted = done
+        return counted
+
+    def _is_due(self, held: Sequence[StageResult], finished: Sequence[StageResult], stages: range, counted: int) -> bool:
+        """Whether a joint descent comes next in a run that goes on: the stages up to it are found, and it was not made."""
+        if not held or JOINT_POLISH in held[-1].seconds:
+            return False
+        return len(held) in (len(stages), self._next(stages, len(held) - 1).stop - stages.start) or self._is_over(
+            [*finished, *held], counted
+        )
 
     def _next(self, stages: range, done: int) -> range:
         """The stages up to the next joint descent."""
@@ -192,7 +215,7 @@ class StrategySculpt(Strategy):
         try:
             yield Revision(tuple(polish_jointly(planner, held, optimizer)), JOINT_POLISH)
         except StagesInterrupted as interruption:
-            yield Revision(interruption.results, JOINT_POLISH)
+            yield Revision(interruption.results, JOINT_POLISH, complete=False)
             raise
 
     def _touches(
@@ -201,7 +224,7 @@ class StrategySculpt(Strategy):
         """Stages one after the other, each by itself; an interrupted one, too, before the interruption goes on."""
         before = list(finished)
         for index in stages:
-            state, warm = (before[-1].state, before[-1].warm) if before else (start.state, None)
+            state, warm = (before[-1].state, before[-1].warm) if before else (start.state, planner.warm_at(start))
             try:
                 before.append(planner.stage(start, index, state, before, warm=warm))
             except StageInterrupted as interruption:
