@@ -170,8 +170,7 @@ def test_the_strategy_polishes_two_stages_at_a_time(task):
 
 def test_the_estimate_counts_the_gradients_that_joint_descents_compute(task):
     """Neither stages nor descents stop early here, so that what is told at most is what is computed."""
-    # All touches are polished at once, so that no further ones are tried where none gains.
-    changes = {"polished": (16, 1), "together": 3, "joint_every": 1, "joint_gradients": 15, "interim_gradients": 4}
+    changes = {"together": 3, "joint_every": 1, "joint_gradients": 15, "interim_gradients": 4}
     efforts = StrategySculpt(**changes).joint_efforts(SimulatorChained(task.scene), stages=3)
     found = [(effort.after, effort.stages, effort.iterations) for effort in efforts]
     assert found == [

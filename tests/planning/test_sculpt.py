@@ -63,41 +63,6 @@ def test_the_best_are_polished_and_none_gets_worse():
     assert all(first is second for first, second in zip(worse, before, strict=True))
 
 
-class BenchOnce(Bench):
-    """Makes what it is given worse, but for the candidates with one loss, which it halves."""
-
-    loss_to_beat = 10.0
-
-    def __init__(self, good):
-        super().__init__(20.0)
-        self.good, self.batches = good, []
-
-    def minimize(self, chosen, optimizer, objective, *, phase, placing):
-        found = super().minimize(chosen, optimizer, objective, phase=phase, placing=placing)
-        self.batches.append(self.asked)
-        found.loss[torch.tensor([loss == self.good for loss in self.asked])] = 0.5 * self.good
-        return found
-
-
-def test_further_candidates_are_polished_until_one_gains():
-    before = candidates([6.0, 1.0, 3.0, 5.0, 2.0, 4.0])
-    polish = PhasePolish(keep=2, batches=3, optimizer=TrajectoryOptimizer(iterations=1), exclusive=True, each_kind=True)
-    bench = BenchOnce(good=4.0)
-    after = polish.run(bench, before)
-    assert bench.batches == [[1.0, 2.0], [3.0, 4.0]]
-    infinite = float("inf")
-    assert [candidate.loss for candidate in after] == [infinite, 20.0, 60.0, infinite, 40.0, 2.0]
-    assert [len(part) for part in bench.batches] == [2, 2]
-    # None gains: all three batches, and no more.
-    bench = BenchOnce(good=7.0)
-    polish.run(bench, before)
-    assert bench.batches == [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]
-    assert polish.effort(6).gradients == (2, 6)
-    assert polish.effort(3).gradients == (2, 3)
-    with pytest.raises(InputError, match="batches"):
-        PhasePolish(keep=2, batches=0, optimizer=TrajectoryOptimizer(iterations=1))
-
-
 def test_variations_of_one_touch_do_not_take_all_places():
     polish = PhasePolish(keep=3, optimizer=TrajectoryOptimizer(iterations=1))
     bench = Bench(0.5)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
@@ -24,7 +23,6 @@ class PhasePolish(Phase):
 
     Attributes:
         keep: Number of candidates that are polished.
-        batches: How many times as many are polished, one after the other, while none is better than leaving the clay alone.
         optimizer: How.
         exclusive: Whether the others get an infinite loss: where their losses are estimates, no plan should be chosen by them.
         each_kind: Whether the kinds of candidates take turns, the best of each first.
@@ -32,12 +30,11 @@ class PhasePolish(Phase):
         name: The phase's name.
 
     Raises:
-        InputError: `keep` or `batches` is below 1.
+        InputError: `keep` is below 1.
     """
 
     scope: ClassVar[Scope] = "search"
     keep: int
-    batches: int = 1
     optimizer: TrajectoryOptimizer
     exclusive: bool = False
     each_kind: bool = False
@@ -45,37 +42,26 @@ class PhasePolish(Phase):
     name: str = "polish"
 
     def __post_init__(self) -> None:
-        for name, number in (("keep", self.keep), ("batches", self.batches)):
-            if number < 1:
-                raise InputError(name, came=str(number), expected="at least 1")
+        if self.keep < 1:
+            raise InputError("keep", came=str(self.keep), expected="at least 1")
 
     def effort(self, candidates: int) -> Effort:
         """See `Phase`."""
-        fewest = self.optimizer.effort(min(self.keep, candidates)).gradients[0]
-        most = self.optimizer.effort(min(self.keep * self.batches, candidates)).gradients[1]
-        return Effort(gradients=(fewest, most))
+        return self.optimizer.effort(min(self.keep, candidates))
 
     def run(self, bench: Workbench, candidates: list[Candidate]) -> list[Candidate]:
         """All candidates, the best of them with better plans; unless `exclusive`, a plan is never worse than before."""
-        chosen = (best_of_each_kind if self.each_kind else best_unlike)(candidates, self.keep * self.batches)
+        chosen = (best_of_each_kind if self.each_kind else best_unlike)(candidates, self.keep)
         if not chosen:
             return candidates
+        some = [candidates[number] for number in chosen]
+        placing = Placing(scene=bench.task.scene) if self.placing else None
+        found = bench.minimize(some, self.optimizer, None, phase=self.name, placing=placing)
+        assert bench.racing is not None
         result = list(candidates)
         if self.exclusive:
             result = [dataclasses.replace(candidate, loss=torch.inf) for candidate in candidates]
-        for first in range(0, len(chosen), self.keep):
-            part = chosen[first : first + self.keep]
-            for number, polished in zip(part, self._polished(bench, [candidates[number] for number in part]), strict=True):
-                if polished.loss < result[number].loss:
-                    result[number] = polished
-            if self.batches > 1 and min(result[number].loss for number in part) < bench.loss_to_beat:
-                break
+        for place, (number, loss, actions) in enumerate(zip(chosen, found.loss.tolist(), found.actions, strict=True)):
+            if loss < result[number].loss:
+                result[number] = dataclasses.replace(bench.racing.plan(place, actions), loss=loss)
         return result
-
-    def _polished(self, bench: Workbench, candidates: Sequence[Candidate]) -> list[Candidate]:
-        """The candidates with better plans, and their losses, which may be higher than before where those were estimates."""
-        placing = Placing(scene=bench.task.scene) if self.placing else None
-        found = bench.minimize(candidates, self.optimizer, None, phase=self.name, placing=placing)
-        assert bench.racing is not None
-        rows = enumerate(zip(found.loss.tolist(), found.actions, strict=True))
-        return [dataclasses.replace(bench.racing.plan(place, actions), loss=loss) for place, (loss, actions) in rows]

@@ -49,9 +49,6 @@ there is little to gain after 80, over three there still is."""
 WORTH_GOING_ON = 0.02
 """Share of the loss that the joint descent after stages without a gain has to take off for the run to go on."""
 
-BATCHES = 3
-"""How many times as many touches of a stage are polished where none of the first ones gains."""
-
 SCREENED = 10_000
 """Candidates that screening leaves to the next phases: all, since it is all rounds together that the best are chosen from."""
 
@@ -70,8 +67,7 @@ class StrategySculpt(Strategy):
     Args:
         touches: Random touches of a stage.
         variations: Touches of each of two rounds of variations.
-        polished: Candidates of the first step of polishing, in which all kinds of touches take their turn, and of the second. Where
-            none of the first ones gains, the next as many follow, up to `BATCHES` times.
+        polished: Candidates of the first step of polishing, in which all kinds of touches take their turn, and of the second.
         iterations: Gradient evaluations of each of them in these steps.
         together: Stages that are polished together.
         joint_gradients: The most gradient evaluations of that descent, of all these stages together; see `LONGEST_JOINT_DESCENT`.
@@ -91,12 +87,12 @@ class StrategySculpt(Strategy):
         *,
         touches: int = 96,
         variations: int = 32,
-        polished: tuple[int, int] = (4, 1),
-        iterations: tuple[int, int] = (4, 6),
+        polished: tuple[int, int] = (10, 2),
+        iterations: tuple[int, int] = (4, 8),
         together: int = 12,
         joint_gradients: int = 960,
         joint_every: int = 3,
-        interim_gradients: int = 240,
+        interim_gradients: int = 120,
         coarse: bool = True,
         idle: int = 3,
     ) -> None:
@@ -130,14 +126,7 @@ class StrategySculpt(Strategy):
         return (
             PhaseScreening(keep=SCREENED),
             *(
-                PhasePolish(
-                    keep=keep,
-                    batches=1 if number else BATCHES,
-                    optimizer=optimizer,
-                    exclusive=number == 0,
-                    each_kind=number == 0,
-                    placing=True,
-                )
+                PhasePolish(keep=keep, optimizer=optimizer, exclusive=number == 0, each_kind=number == 0, placing=True)
                 for number, (keep, optimizer) in enumerate(optimizers)
             ),
         )
