@@ -6,12 +6,17 @@ import dataclasses
 
 import pytest
 import torch
-from cpdeform_toy.parts import OTSolverToy
+from cpdeform_toy.parts import OTSolverToy, PlacerToy
 from cpdeform_toy.simulator import SimulatorToy
 
+from cpdeform.core.objective import ObjectiveAutograd
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.task import load_task
+from cpdeform.planning.algorithm import Planner
 from cpdeform.planning.joint import PHASE
+from cpdeform.planning.optimizer import TrajectoryOptimizer
+from cpdeform.planning.phases.descent import PhaseDescent
+from cpdeform.planning.pruner import PrunerNone
 from cpdeform.planning.result import Observer
 from cpdeform.run import record as record_module
 from cpdeform.run.record import RunRecorder, load_record
@@ -199,3 +204,37 @@ def test_stages_without_a_plan_count_as_done(whole):
     record, _ = whole
     assert resumed_values(dataclasses.replace(record, stages=record.stages[:2]), {})["stages"] == STAGES - 2
     assert resumed_values(record, {})["stages"] == 1
+
+
+class Remembering(ObjectiveAutograd):
+    """Distance of the centre of mass from a point; what it starts from changes its gradient, as that of a solver does."""
+
+    def loss(self, positions, tool_poses):
+        centre = positions[:, -1].mean(dim=1)
+        return (centre - centre.new_tensor([2.0, 0.5, 0.5])).square().sum(dim=-1)
+
+    def evaluate(self, trajectory, warm=None):
+        found = super().evaluate(trajectory)
+        steps = [0 if entry is None else entry for entry in (warm or [None] * len(found.loss))]
+        turned = found.grad_positions.roll(1, dims=-1) * found.loss.new_tensor(steps)[:, None, None, None]
+        return dataclasses.replace(
+            found, grad_positions=found.grad_positions + 0.1 * turned, warm=tuple(step + 1 for step in steps)
+        )
+
+
+@pytest.mark.parametrize("continued", [True, False])
+def test_a_run_that_goes_on_starts_its_objective_as_the_stage_before_would_have(make_toy_task, continued):
+    task = load_task(make_toy_task(stage_count=2, step_count=5))
+    planner = Planner(
+        task=task,
+        simulator=SimulatorToy(task.scene, batch_size=4),
+        ot_solver=OTSolverToy(),
+        placer=PlacerToy(),
+        objective=Remembering(),
+        phases=[PhaseDescent(optimizer=TrajectoryOptimizer(iterations=3, pruner=PrunerNone()))],
+    )
+    whole = planner.run(stages=2).stages
+    first = planner.run(stages=1).stages
+    rest = planner.run(stages=1, state=first[0].state, first_stage=1, previous=first, continued=continued).stages
+    assert torch.equal(first[0].state.position, whole[0].state.position)
+    assert torch.equal(rest[0].state.position, whole[1].state.position) is continued
