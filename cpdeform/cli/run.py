@@ -108,7 +108,7 @@ def run(
     if as_json:
         typer.echo(json.dumps(_summary(result, resolved, directory, resumed_from=resume)))
     elif not quiet:
-        _print_summary(result, directory, picture, resumed_from=resume)
+        _print_summary(result, directory, picture, resumed_from=resume, first_stage=resolved.first_stage)
     if not _finished(result):
         raise typer.Exit(1)
 
@@ -323,7 +323,9 @@ def _effort(result: DeformResult) -> str:
     return f"{counted(result.gradient_evaluations, 'gradient evaluation')}, {counted(result.rollouts, 'rollout')} without gradient"
 
 
-def _print_summary(result: DeformResult, directory: Path, picture: Path | None, *, resumed_from: Path | None) -> None:
+def _print_summary(
+    result: DeformResult, directory: Path, picture: Path | None, *, resumed_from: Path | None, first_stage: int
+) -> None:
     from cpdeform.cli.progress import megabytes
     from cpdeform.core.wording import counted
 
@@ -337,7 +339,7 @@ def _print_summary(result: DeformResult, directory: Path, picture: Path | None, 
         figures = f"{megabytes(result.memory.peak)} at the peak, {megabytes(result.memory.estimate)} estimated"
         lines.append(f"  memory   {figures} (rollout and gradient, worlds {result.memory.worlds})")
     if resumed_from is not None:
-        lines.append(f"  resumed  from {resumed_from}, at stage {result.stages[0].index + 1}")
+        lines.append(f"  resumed  from {resumed_from}, at stage {first_stage + 1}")
     lines.append(f"  record   {directory}")
     if picture is not None:
         lines.append(f"  picture  {picture}")
