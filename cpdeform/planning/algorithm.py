@@ -284,7 +284,14 @@ class Planner:
         )
 
     def warm_at(self, start: Start) -> tuple[object, ...] | None:
-        """What the objective can start from at the start of a run that goes on, as its last stage would have told."""
+        """What the objective can start from where a run goes on: the same as its last stage told when it was found.
+
+        Args:
+            start: Where the run goes on.
+
+        Returns:
+            An entry for the single world; None for a run from its start, or one whose parts or settings are others now.
+        """
         if not (start.continued and start.previous):
             return None
         return self.objective.evaluate(still_trajectory(start.state, self.task.rollout_steps, scene=self.task.scene)).warm

@@ -9,14 +9,15 @@ from cpdeform.planning.result import StageResult
 
 
 def taken_up(planner: Planner, start: Start) -> list[StageResult]:
-    """The stages that a run goes on from and may revise, on the simulator's device; none where its parts or settings are others.
+    """The stages that a run goes on from and may revise; none where its parts or settings are others.
 
     Args:
         planner: The parts.
         start: Where the run goes on.
 
     Returns:
-        The stages. Those at the end, from the last one with a plan on, tell again what the objective can start from.
+        The stages, their states (single worlds) and actions (T, A) on the simulator's device and of its type. Those at the end,
+        from the last one with a plan on, tell again what the objective can start from.
     """
     if not start.continued:
         return []
@@ -27,6 +28,7 @@ def taken_up(planner: Planner, start: Start) -> list[StageResult]:
             stage,
             state=stage.state.to(device=device, dtype=dtype),
             state_before=stage.state_before.to(device=device, dtype=dtype),
+            actions=None if stage.actions is None else stage.actions.to(device=device, dtype=dtype),
             warm=warm if number >= last else None,
         )
         for number, stage in enumerate(start.previous)

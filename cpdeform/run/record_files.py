@@ -47,12 +47,12 @@ def stage_files(directory: Path) -> list[Path]:
 
 
 def unrevised_file(index: int) -> str:
-    """Name of the copy of a stage's file that is kept until a revision of it is complete."""
+    """Name of the copy of a stage's file that is kept, when the stage is revised, until the next one is finished."""
     return f"unrevised-{index:03d}.h5"
 
 
 def unrevised_files(directory: Path) -> dict[int, Path]:
-    """Copies of stages' files that a revision which broke off has left, by the numbers of the stages."""
+    """Copies of stages' files from before the last revision, by the numbers of the stages, in order."""
     found = [(UNREVISED_PATTERN.fullmatch(path.name), path) for path in directory.iterdir()]
     return {int(match[1]): path for match, path in sorted(found, key=lambda pair: pair[1]) if match}
 

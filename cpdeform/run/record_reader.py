@@ -121,7 +121,7 @@ def load_record(directory: Path | str, *, limits: ReadingLimits | None = None) -
 
 
 def with_unrevised_stages(record: RunRecord) -> RunRecord:
-    """A record with its stages as they were before a revision that broke off; the record itself where there was none.
+    """A record with its stages as they were before the last revision; the record itself where no copies of these are left.
 
     Raises:
         InputError: A file is damaged or too large.

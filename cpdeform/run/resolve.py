@@ -26,6 +26,7 @@ from cpdeform.core.simulator import Simulator
 from cpdeform.core.state import State
 from cpdeform.core.task import Task, changed_task, limited_task, load_task, merge, validate
 from cpdeform.planning.algorithm import Planner
+from cpdeform.planning.effort import JointEffort
 from cpdeform.planning.executor import Executor, ExecutorSerial
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.result import Observer, StageResult
@@ -214,8 +215,19 @@ class ResolvedRun:
         configuration = self.configuration
         effort = self.strategy.effort(stage_effort(planner))
         stages = configuration.stages or self.task.stage_count
-        joint = self.strategy.joint_efforts(planner.simulator, stages=stages)
+        joint = self.joint_efforts(planner.simulator, stages=stages)
         return estimate_run(planner, stages=stages, workers=configuration.workers, effort=effort, joint=joint)
+
+    def joint_efforts(self, simulator: Simulator, *, stages: int) -> tuple[JointEffort, ...]:
+        """What the strategy's joint descents cost, counted from the stage that the run begins with; see `Strategy.joint_efforts`.
+
+        Args:
+            simulator: The run's simulator.
+            stages: Number of stages of the run. Where it goes on as it began, its descents go over the stages before, too.
+        """
+        done = len(self.previous) if self.continued else 0
+        efforts = self.strategy.joint_efforts(simulator, stages=done + stages)
+        return tuple(dataclasses.replace(effort, after=effort.after - done) for effort in efforts if effort.after > done)
 
     def run(
         self, observers: Sequence[Observer] = (), *, on_estimate: Callable[[RunEstimate | None], None] | None = None

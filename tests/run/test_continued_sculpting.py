@@ -12,12 +12,13 @@ from cpdeform_toy.simulator import SimulatorToy
 from cpdeform.core.objective import ObjectiveAutograd
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.task import load_task
-from cpdeform.planning.algorithm import Planner
+from cpdeform.planning.algorithm import Planner, Start
 from cpdeform.planning.joint import PHASE
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.descent import PhaseDescent
 from cpdeform.planning.pruner import PrunerNone
 from cpdeform.planning.result import Observer
+from cpdeform.planning.taken_up import taken_up
 from cpdeform.run import record as record_module
 from cpdeform.run.record import RunRecorder, load_record
 from cpdeform.run.record_continued import RunContinuer, broken_off
@@ -197,6 +198,35 @@ def test_with_other_settings_the_stages_before_are_left_alone(run, whole, regist
         resolved = resolve(changes, registry=registry, record=short, objects=objects)
         assert resolved.continued is (not changes)
         assert [stage.index for stage in resolved.run().stages] == expected
+
+
+def test_the_estimate_counts_the_stages_before(run, whole, registry):
+    """Descents after the fourth and sixth stage, the first one over all four."""
+    record, _ = whole
+    simulator = SimulatorChained(record.task.scene, batch_size=4)
+    objects = PartObjects(simulator=simulator, ot_solver=OTSolverToy())
+    short = dataclasses.replace(record, stages=record.stages[:2])
+    resolved = resolve({}, registry=registry, record=short, objects=objects)
+    efforts = resolved.joint_efforts(simulator, stages=4)
+    assert [(effort.after, effort.stages, effort.iterations) for effort in efforts] == [(2, 4, (3, 3)), (4, 2, (6, 6))]
+
+
+def test_stages_are_taken_up_with_the_type_of_the_simulator(whole):
+    """As new stages have it: the actions of all of them become one plan."""
+    record, _ = whole
+    single = [
+        dataclasses.replace(stage, actions=stage.actions.float(), state=stage.state.to(dtype=torch.float32))
+        for stage in record.stages
+    ]
+    simulator = SimulatorChained(record.task.scene, batch_size=4)
+    planner = Planner(
+        task=record.task, simulator=simulator, ot_solver=OTSolverToy(), placer=PlacerToy(), objective=Remembering(), phases=[]
+    )
+    start = Start(state=record.state, goal=record.goal, first_stage=6, stages=1, previous=tuple(single), continued=True)
+    stages = taken_up(planner, start)
+    assert {stage.actions.dtype for stage in stages} == {stage.state.position.dtype for stage in stages} == {simulator.dtype}
+    assert [stage.warm for stage in stages] == [None] * 5 + [(1,)]
+    assert taken_up(planner, dataclasses.replace(start, continued=False)) == []
 
 
 def test_stages_without_a_plan_count_as_done(whole):
