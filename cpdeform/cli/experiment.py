@@ -91,7 +91,9 @@ def experiment(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="quick: small, for a look; paper: the tasks as they are, five seeds. Other options override it.", metavar="NAME"
+            help="quick: small, for a look; standard: three stages, three seeds; paper: the tasks as they are, five seeds. Other "
+            "options override it.",
+            metavar="NAME",
         ),
     ] = None,
     size: Annotated[int | None, typer.Option(help="(landscape) Starts along x and along z. Defaults to 20.")] = None,

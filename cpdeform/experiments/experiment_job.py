@@ -110,7 +110,9 @@ def _configured(context: JobContext, run: PlannedRun, settings: ExperimentSettin
     if reference is None or not reference.stages_tried or reference.gradient_evaluations is None:
         return plain
     cost = (reference.gradient_evaluations + share * (reference.rollouts or 0)) / reference.stages_tried
-    budget = budget_values(run.method, cost, share=share, iterations=plain.configuration.optimizer.iterations)
+    stages = plain.configuration.stages or plain.task.stage_count
+    iterations = plain.configuration.optimizer.iterations
+    budget = budget_values(run.method, cost, share=share, iterations=iterations, stages=stages)
     return configure(run, settings, registry=registry, budget=budget)
 
 

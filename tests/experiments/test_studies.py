@@ -16,11 +16,15 @@ from typer.testing import CliRunner
 from cpdeform.cli.main import app
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.task import load_task
+from cpdeform.experiments import experiment_row
+from cpdeform.experiments.experiment_plan import ExperimentSettings, configure, planned_runs
+from cpdeform.experiments.shape_figures import SHAPE_FIGURES
 from cpdeform.experiments.studies import equal_cost, rivals
 from cpdeform.experiments.studies.equal_cost import JUDGED, budget_values, known_shares, rollout_share
 from cpdeform.experiments.studies.statistics import Interval, mean, rank_correlation
 from cpdeform.experiments.studies.study import PRESETS, STUDIES
 from cpdeform.experiments.studies.trace import learning_curve, stage_points, value_at
+from cpdeform.planning.strategies import sculpt
 from cpdeform.planning.strategies.sculpt import StrategySculpt
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record import load_record
@@ -117,6 +121,20 @@ def test_every_method_is_sized_for_the_budget(method, cost, share):
     assert gradients + share * rollouts == pytest.approx(cost, rel=0.35)
 
 
+@pytest.mark.parametrize("stages", [2, 3, 8, 12, 24])
+def test_descents_over_several_touches_are_within_the_budget(stages, monkeypatch):
+    monkeypatch.setattr(sculpt, "takes_final_gradient", lambda simulator: True)
+    cost, share = 60.0, 0.2
+    options = budget_values("sculpt", cost, share=share, iterations=20, stages=stages)["strategy_options"]
+    strategy = StrategySculpt(**options)
+    joint = strategy.joint_efforts(None, stages=stages)
+    assert joint[-1].after == stages
+    gradients = sum(part.stages * part.iterations[1] for part in joint)
+    assert gradients == pytest.approx(equal_cost.JOINT_SHARE_OF_SEVERAL * cost * stages, rel=0.35)
+    gradients += stages * sum(math.prod(step) for step in zip(strategy.polished, strategy.iterations, strict=True))
+    assert gradients + stages * share * (strategy.touches + 2 * strategy.variations) == pytest.approx(cost * stages, rel=0.2)
+
+
 def test_the_search_study(folder):
     finished = experiment("search", *RUNS, "--out", "out")
     assert finished.exit_code == 0, finished.output
@@ -177,6 +195,32 @@ def test_rivals_spend_what_the_reference_spent(folder, monkeypatch):
         _, verdict = text.split(f"its W1 minus that of {own}, same seeds |")
         assert verdict.splitlines()[2].startswith(f"| shift | {'yes' if ahead else 'no'} | fixed | {behind.value:.4f}")
     assert known_shares(Path("out"))["shift"] > 0.0
+    assert "The shapes of the same runs" not in text
+
+
+def test_rivals_show_the_shapes_where_they_are_asked_for(folder, monkeypatch):
+    rest = {"shape_iou_start": 0.25, "shape_iou_final": 0.5, "shape_iou_ceiling": 0.75, "normalised_shape_iou": 0.625}
+    monkeypatch.setattr(experiment_row, "shape_figures", lambda record: {**dict.fromkeys(SHAPE_FIGURES), **rest})
+    finished = experiment("rivals", *RUNS, "--shape", "--out", "out")
+    assert finished.exit_code == 0, finished.output
+    assert [float(line["normalised_shape_iou"]) for line in values("out")] == [0.625] * 3
+    _, shapes = Path("out/summary.md").read_text().split("## The shapes of the same runs")
+    assert "| shift | 0.62 [0.62, 0.62] | 0.62 [0.62, 0.62] | 0.62 [0.62, 0.62] |" in shapes
+
+
+def test_iterations_are_for_the_methods_that_take_them(folder):
+    registry = load_registry()
+    options = {"name": "rivals", "tasks": ("shift.yaml",), "out": Path("out"), "iterations": 7, "backend": "toy", "ot": "pot"}
+    settings = ExperimentSettings(**options, methods=("cpdeform", "sculpt"))
+    own, touches = planned_runs(settings, registry=registry)
+    assert configure(own, settings, registry=registry).configuration.optimizer.iterations == 7
+    # Warnings are errors here.
+    assert configure(touches, settings, registry=registry).configuration.optimizer.iterations != 7
+    # Who asks for them for this method alone is told.
+    alone = ExperimentSettings(**options, methods=("sculpt",))
+    resolved = configure(touches, alone, registry=registry)
+    with pytest.warns(UserWarning, match="--iterations: no effect"):
+        resolved.planner()
 
 
 def test_of_workers_that_measure_at_once_the_first_one_counts(folder, monkeypatch):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from cpdeform_toy.parts import OTSolverToy, PlacerToy
 from cpdeform_toy.simulator import SimulatorToy
+from toy_fixtures import write_toy_task
 
 from cpdeform.core.objective import ObjectiveAutograd
 from cpdeform.core.plugins import load_registry
@@ -70,15 +71,16 @@ class Break(Observer):
         self.note((revision.results[-1].index, "revised"))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def registry():
     return load_registry()
 
 
-@pytest.fixture
-def run(make_toy_task, registry, tmp_path):
-    """Runs the toy task into a directory, or goes on with what is there."""
-    task = load_task(make_toy_task(stage_count=STAGES, step_count=5, offset=0.3))
+@pytest.fixture(scope="module")
+def run(registry, tmp_path_factory):
+    """Runs the toy task into a directory of this module, or goes on with what is there."""
+    tmp_path = tmp_path_factory.mktemp("continued")
+    task = load_task(write_toy_task(tmp_path, stage_count=STAGES, step_count=5, offset=0.3))
     objects = PartObjects(simulator=SimulatorChained(task.scene, batch_size=4), ot_solver=OTSolverToy())
     values = {"strategy": "sculpt", "strategy_options": {**NUMBERS, **JOINT}, "seed": 2, "objective": {"points": None}}
 
@@ -99,7 +101,7 @@ def run(make_toy_task, registry, tmp_path):
     return start, go_on
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def whole(run):
     """The run that nothing disturbs, and what it tells."""
     start, _ = run
@@ -131,13 +133,14 @@ def test_the_run_has_joint_descents_on_the_way_and_at_each_end(whole):
     assert record.stages[0].gradient_evaluations == 3 + 4 // 2 + 12 // 4
 
 
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_a_run_that_breaks_off_anywhere_goes_on_as_if_it_had_not(run, whole, error):
+@pytest.mark.parametrize(("error", "first"), [(RuntimeError, 0), (KeyboardInterrupt, 1)])
+def test_a_run_that_breaks_off_anywhere_goes_on_as_if_it_had_not(run, whole, error, first):
     """Killed or interrupted in descents over two, four and two stages, when these are recorded, and in and between stages."""
     start, go_on = run
     record, log = whole
     joint = [number for number, (_, what) in enumerate(log) if what == PHASE]
-    events = {*joint[1::3], *(number for number, (_, what) in enumerate(log) if what == "revised"), *range(7, len(log), 25)}
+    between = range(7 + 25 * first, len(log), 50)
+    events = {*joint[1 + first :: 4], *(number for number, (_, what) in enumerate(log) if what == "revised"), *between}
     assert {log[number] for number in events} >= {(last, what) for last in (1, 3, 5) for what in (PHASE, "revised")}
     for event in sorted(events):
         with pytest.raises(error):

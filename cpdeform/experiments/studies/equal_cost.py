@@ -29,8 +29,8 @@ POPULATION, SAMPLES, KEPT = 16, 32, 3
 LEARNERS, JUDGED = ("sac", "ppo", "td3"), 3
 """Learners, whose episodes are rollouts, and the rollouts that each spends on judging what it has learnt."""
 
-JOINT_SHARE = 0.25
-"""Part of a stage's cost that `sculpt` spends in a descent over the touch that it has found."""
+JOINT_SHARE, JOINT_SHARE_OF_SEVERAL = 0.25, 0.4
+"""Part of the cost that `sculpt` spends in descents over touches that it has found: over a single one, and over several."""
 
 REPEATS = 5
 
@@ -95,7 +95,7 @@ def measured_share(task: Task, configuration: RunConfiguration, *, registry: Reg
     return round(min(alone[1:]) / min(whole[1:]), 3)
 
 
-def budget_values(method: str, cost: float, *, share: float, iterations: int) -> dict[str, Any]:
+def budget_values(method: str, cost: float, *, share: float, iterations: int, stages: int = 1) -> dict[str, Any]:
     """Values of a method's configuration with which a stage costs about as much as it may.
 
     Args:
@@ -103,6 +103,7 @@ def budget_values(method: str, cost: float, *, share: float, iterations: int) ->
         cost: What a stage may cost, in gradient evaluations.
         share: What a rollout without gradient costs.
         iterations: Gradient evaluations of a descent where the method makes several.
+        stages: Stages of the run.
 
     Returns:
         Fields of `RunConfiguration`, nested; none for a method that has no such size.
@@ -129,7 +130,7 @@ def budget_values(method: str, cost: float, *, share: float, iterations: int) ->
     if method in LEARNERS:
         return {"strategy_options": {"episodes": max(1, rollouts - JUDGED)}}
     if method == "sculpt":
-        return {"strategy_options": _touches(cost, share=share)}
+        return {"strategy_options": _touches(cost, share=share, stages=stages)}
     if method == "sampled-gradients":
         kept = min(KEPT, max(1, whole // 2))
         descent = max(1, round(0.5 * cost / kept))
@@ -141,14 +142,14 @@ def budget_values(method: str, cost: float, *, share: float, iterations: int) ->
     return {}
 
 
-def _touches(cost: float, *, share: float) -> dict[str, Any]:
-    """Options of `sculpt`: fewer touches and fewer of them polished, each stage by itself."""
+def _touches(cost: float, *, share: float, stages: int) -> dict[str, Any]:
+    """Options of `sculpt`: fewer touches and fewer of them polished, and shorter descents over all stages."""
     full = StrategySculpt()
-    # What a joint descent may not use goes to the touches.
-    joint = joint_optimizer(stages=1, gradients=round(JOINT_SHARE * cost)).iterations
+    descents, joint = _joint_descents(full, cost, stages)
+    # What joint descents may not use goes to the touches.
     steps = list(zip(full.polished, full.iterations, strict=True))
     rollouts, gradients = full.touches + 2 * full.variations, sum(math.prod(step) for step in steps)
-    part = (cost - joint) / (share * rollouts + gradients)
+    part = (cost - joint / stages) / (share * rollouts + gradients)
     polished = tuple(max(1, round(part * count)) for count in full.polished)
     # One candidate may be more than the part of a step; its gradients then make up for it.
     iterations = tuple(max(1, round(part * math.prod(step) / kept)) for step, kept in zip(steps, polished, strict=True))
@@ -157,6 +158,19 @@ def _touches(cost: float, *, share: float) -> dict[str, Any]:
         "variations": max(2, round(part * full.variations)),
         "polished": polished,
         "iterations": iterations,
-        "together": 1,
-        "joint_gradients": joint,
+        **descents,
     }
+
+
+def _joint_descents(full: StrategySculpt, cost: float, stages: int) -> tuple[dict[str, int], int]:
+    """Options of `sculpt` for joint descents, the last one twice as long as those on the way, and the gradients of all of them."""
+    together = min(stages, full.together)
+    share = JOINT_SHARE if stages == 1 else JOINT_SHARE_OF_SEVERAL
+    chapters, parts = math.ceil(stages / together), math.ceil(together / full.joint_every)
+    interim = max(1, round(share * cost * stages / (chapters * (parts + 1))))
+    options = {"together": together, "interim_gradients": interim, "joint_gradients": 2 * interim}
+    lengths = [
+        joint_optimizer(stages=count, gradients=interim * (1 + (count == together))).iterations * count
+        for count in (min(number * full.joint_every, together) for number in range(1, parts + 1))
+    ]
+    return options, chapters * sum(lengths)

@@ -1,14 +1,15 @@
-"""The rivals study: all methods at equal cost, in gradient evaluations and in seconds."""
+"""The rivals study: all methods at equal cost, in gradient evaluations and in seconds, and the shapes they come to."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from cpdeform.experiments.experiment import family
 from cpdeform.experiments.experiment_plan import REFERENCE
 from cpdeform.experiments.experiment_tables import paper_figures
+from cpdeform.experiments.shape_figures import SHAPE_NOTE
 from cpdeform.experiments.studies.figures import colour, new_figure
 from cpdeform.experiments.studies.runs import StudyRun, chosen, methods_of, tasks_of
 from cpdeform.experiments.studies.search import final_distance
@@ -37,6 +38,7 @@ def summarize(runs: Sequence[StudyRun], shares: Mapping[str, float]) -> Summary:
             "## At equal cost, in gradient evaluations",
             _table(runs, tasks, methods, found),
             _verdict(runs, tasks, methods, found),
+            *_shapes(tasks, methods, found),
             "## Within the same seconds",
             _seconds_table(tasks, methods, found),
             _notes(shares),
@@ -51,7 +53,8 @@ def _values(runs: Sequence[StudyRun], task: str, method: str, share: float) -> d
     difference = _difference(runs, task, method, REFERENCE)
     ratio = mean([_ratio_within(run, _seconds(other)) for run, other in _pairs(runs, task, method, REFERENCE)])
     line: dict[str, Any] = {"task": task, "method": method, "seeds": final.count, "rollout_share": share}
-    intervals = {"w1_final": final, "w1_minus_reference": difference, "loss_ratio_in_seconds": ratio}
+    shape = mean([_number(run.row.normalised_shape_iou) for run in own])
+    intervals = {"w1_final": final, "normalised_shape_iou": shape, "w1_minus_reference": difference, "loss_ratio_in_seconds": ratio}
     intervals["cost"] = mean([_cost(run, share) for run in own])
     intervals["seconds"] = mean([_seconds(run) for run in own])
     for name, interval in intervals.items():
@@ -59,8 +62,12 @@ def _values(runs: Sequence[StudyRun], task: str, method: str, share: float) -> d
     return line
 
 
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
 def _final(run: StudyRun) -> float:
-    return math.nan if run.row.w1_final is None else run.row.w1_final
+    return _number(run.row.w1_final)
 
 
 def _cost(run: StudyRun, share: float) -> float:
@@ -89,7 +96,7 @@ def _table(
     paper = paper_figures("multi-stage")
     lines = []
     for task in tasks:
-        first = mean([math.nan if run.row.w1_initial is None else run.row.w1_initial for run in runs if run.row.task == task])
+        first = mean([_number(run.row.w1_initial) for run in runs if run.row.task == task])
         cells = []
         for method in methods:
             line = found[task, method]
@@ -140,6 +147,19 @@ def _pairs(runs: Sequence[StudyRun], task: str, method: str, other: str) -> list
     """Runs of two methods that are over, with the same seeds."""
     found = {run.row.seed: run for run in chosen(runs, task, other) if run.row.over}
     return [(run, found[run.row.seed]) for run in chosen(runs, task, method) if run.row.over and run.row.seed in found]
+
+
+def _shapes(tasks: Sequence[str], methods: Sequence[str], found: Mapping[tuple[str, str], Mapping[str, Any]]) -> Iterator[str]:
+    """The normalised shape IoUs; nothing where they were not asked for."""
+    lines = [
+        [task, *(_interval(found[task, method], "normalised_shape_iou").text(".2f") for method in methods)]
+        for task in tasks
+        if any(math.isfinite(found[task, method]["normalised_shape_iou"]) for method in methods)
+    ]
+    if lines:
+        yield "## The shapes of the same runs"
+        yield markdown(["task", *methods], lines)
+        yield f"Normalised shape IoU; higher is better. {SHAPE_NOTE}"
 
 
 def _seconds_table(tasks: Sequence[str], methods: Sequence[str], found: Mapping[tuple[str, str], Mapping[str, Any]]) -> str:

@@ -67,13 +67,19 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         # A run within two minutes of one core. All particles stay: goals that are the body's particles, moved, need them.
         "quick": MappingProxyType({"seeds": "0,1,2", "iterations": 6, "stages": 1}),
+        # Enough for methods to show what they can do, within about ten minutes a run.
+        "standard": MappingProxyType({"seeds": "0,1,2", "iterations": 20, "stages": 3}),
         "paper": MappingProxyType({"seeds": "0,1,2,3,4"}),
     }
 )
 """Values of the options of `cpdeform experiment` where none are given."""
 
 LANDSCAPE_PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {"quick": MappingProxyType({"size": 8, "iterations": 4}), "paper": MappingProxyType({"size": 20})}
+    {
+        "quick": MappingProxyType({"size": 8, "iterations": 4}),
+        "standard": MappingProxyType({"size": 12, "iterations": 20}),
+        "paper": MappingProxyType({"size": 20}),
+    }
 )
 """Those of the landscape."""
 
