@@ -21,7 +21,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.memory_limit import check_memory
 from cpdeform.core.objective import Objective
 from cpdeform.core.ot import OTSolver, TransportProblem
-from cpdeform.core.placer import LEAST_GAIN, Candidate, Placer, Stage
+from cpdeform.core.placer import Candidate, Placer, Stage
 from cpdeform.core.simulator import Simulator
 from cpdeform.core.state import State
 from cpdeform.core.task import Task
@@ -32,6 +32,7 @@ from cpdeform.planning.metrics import evaluate_metric
 from cpdeform.planning.optimizer import Iteration
 from cpdeform.planning.phases.phase import Phase
 from cpdeform.planning.result import DeformResult, Observer, Revision, StageResult, Status
+from cpdeform.planning.stage_parts import failed_contacts, search_status, stage_generator, stage_result
 from cpdeform.planning.still import still_trajectory
 from cpdeform.planning.workbench import Workbench, is_finite
 
@@ -232,13 +233,13 @@ class Planner:
             best = best_so_far(bench, self.phases, execution, self._execute)
             if best is None:
                 raise
-            raise StageInterrupted(_stage_result(bench, *best, Status.INTERRUPTED, execution)) from interruption
+            raise StageInterrupted(stage_result(bench, *best, Status.INTERRUPTED, execution)) from interruption
 
     def _plan(self, bench: Workbench, candidates: list[Candidate], execution: Execution) -> StageResult:
         """Execute the best candidate of a stage, and let further phases work on it."""
         # "execute the plan with the lowest loss"
         best = min(range(len(candidates)), key=lambda number: candidates[number].loss, default=None)
-        status = _search_status(candidates, best, bench.loss_to_beat)
+        status = search_status(candidates, best, bench.loss_to_beat)
         if best is not None and status is Status.FINISHED:
             self.tell_part(bench.stage.index, "execution")
             status = self._execute(bench, self._phases("round", "search")[-1], candidates[best], execution)
@@ -250,7 +251,7 @@ class Planner:
                     self._execute(bench, phase, changed, execution)
                 bench.lap(phase.name)
             candidates[best] = execution.candidate or candidates[best]
-        return _stage_result(bench, candidates, best, status, execution)
+        return stage_result(bench, candidates, best, status, execution)
 
     def execute_other(self, result: StageResult, number: int) -> StageResult | None:
         """What a stage would have come to by another of its candidates, for loops that follow several ways at once.
@@ -406,61 +407,3 @@ def contact_points_discovery(planner: Planner, start: Start) -> Iterator[StageRe
         if result.status is not Status.FINISHED:
             return
         state, warm = result.state, result.warm
-
-
-def stage_generator(seed: int, index: int) -> torch.Generator:
-    """Random numbers of the stage with the given number; they depend on nothing that happened before it."""
-    if index > 0:
-        seed = int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
-    return torch.Generator().manual_seed(seed)
-
-
-def failed_contacts(stages: Sequence[StageResult]) -> tuple[int, ...]:
-    """Contact particles of the candidates of all stages since the last one that gained at least `LEAST_GAIN`.
-
-    Those of an interrupted stage are not among them, since they had no chance to show what they gain.
-    """
-    found: list[int] = []
-    for stage in reversed(stages):
-        if stage.loss < (1.0 - LEAST_GAIN) * stage.loss_before:
-            break
-        if stage.status is Status.INTERRUPTED:
-            continue
-        contacts = [candidate.proposal.contact_particle for candidate in stage.candidates]
-        found += [contact for contact in contacts if contact is not None]
-    return tuple(dict.fromkeys(found))
-
-
-def _search_status(candidates: Sequence[Candidate], best: int | None, loss_before: float) -> Status:
-    if best is None:
-        return Status.NO_PLACEMENT
-    if candidates[best].loss < loss_before:
-        return Status.FINISHED
-    return Status.NO_IMPROVEMENT if any(candidate.finite for candidate in candidates) else Status.NON_FINITE
-
-
-def _stage_result(
-    bench: Workbench, candidates: list[Candidate], best: int | None, status: Status, execution: Execution
-) -> StageResult:
-    """What a stage came to; without an executed plan its state is the one before."""
-    trajectory, state = execution.trajectory, bench.stage.state
-    bench.seconds["total"] = bench.total()
-    return StageResult(
-        index=bench.stage.index,
-        status=status,
-        state_before=state,
-        state=state if trajectory is None else trajectory.final_state,
-        priorities=bench.stage.priorities,
-        candidates=tuple(candidates),
-        best=None if trajectory is None else best,
-        actions=None if trajectory is None else trajectory.actions[0],
-        positions=None if trajectory is None else trajectory.positions[0],
-        tool_poses=None if trajectory is None else trajectory.tool_poses[0],
-        loss_before=bench.stage.loss,
-        loss=execution.loss,
-        gradient_evaluations=bench.gradient_evaluations,
-        rollouts=bench.rollouts,
-        history=tuple(bench.history),
-        seconds=bench.seconds,
-        warm=execution.warm,
-    )

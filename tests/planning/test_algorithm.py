@@ -14,12 +14,13 @@ from cpdeform.core.ot import TransportProblem
 from cpdeform.core.placer import LEAST_GAIN
 from cpdeform.core.plugins import load_registry
 from cpdeform.core.task import load_task
-from cpdeform.planning.algorithm import Planner, failed_contacts
+from cpdeform.planning.algorithm import Planner
 from cpdeform.planning.objectives.transport import ObjectiveTransport
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.descent import PhaseDescent
 from cpdeform.planning.pruner import PrunerHalving, PrunerNone
 from cpdeform.planning.result import Observer, Status
+from cpdeform.planning.stage_parts import failed_contacts
 from cpdeform.planning.still import still_trajectory
 from cpdeform.run.configuration import PrioritiesConfiguration, RunConfiguration
 from cpdeform.run.deform import deform

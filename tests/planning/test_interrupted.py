@@ -11,13 +11,14 @@ from cpdeform_toy.simulator import SimulatorToy
 
 from cpdeform.core.objective import ObjectiveAutograd
 from cpdeform.core.task import load_task
-from cpdeform.planning.algorithm import Planner, failed_contacts
+from cpdeform.planning.algorithm import Planner
 from cpdeform.planning.interrupted import StageInterrupted
 from cpdeform.planning.objectives.transport import ObjectiveTransport
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.phases.descent import REFINEMENT, PhaseDescent, PhaseRefinement
 from cpdeform.planning.pruner import PrunerNone
 from cpdeform.planning.result import Observer, Status
+from cpdeform.planning.stage_parts import failed_contacts
 from cpdeform.planning.strategies.look_ahead import StrategyLookAhead
 
 

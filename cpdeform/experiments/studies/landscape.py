@@ -17,9 +17,10 @@ from cpdeform.core.placer import Stage
 from cpdeform.core.plugins import Registry
 from cpdeform.core.reading.json_text import read_json
 from cpdeform.placement.grid import movable_tools
-from cpdeform.planning.algorithm import Planner, stage_generator
+from cpdeform.planning.algorithm import Planner
 from cpdeform.planning.optimizer import TrajectoryOptimizer
 from cpdeform.planning.pruner import PrunerNone
+from cpdeform.planning.stage_parts import stage_generator
 from cpdeform.planning.still import still_trajectory
 from cpdeform.run.record_files import to_json, write_json
 from cpdeform.run.resolve import resolve
