@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -17,6 +19,7 @@ from cpdeform.placement.touches.parking import parked
 from cpdeform.placement.touches.pinch import TouchPinch
 from cpdeform.placement.touches.placer import PlacerTouch, place
 from cpdeform.placement.touches.push import TouchPress, TouchPush
+from cpdeform.placement.touches.stroke import TouchStroke
 from cpdeform.placement.touches.touch import Room, facing
 from cpdeform.testing.placer import transport_of
 
@@ -27,6 +30,7 @@ BLADE = {
     "action_scale": (0.01, 0.01, 0.01),
 }
 BALL = {"kind": "Sphere", "radius": 0.03, "action_scale": (0.02, 0.0, 0.02)}
+PEN = {"kind": "Capsule", "radius": 0.02, "height": 0.04, "action_scale": (0.02, 0.02, 0.02)}
 SHIFT = torch.tensor([0.05, 0.0, 0.0])
 
 
@@ -96,6 +100,36 @@ def test_tools_move_towards_the_clay_and_back_off_at_the_end() -> None:
     assert torch.allclose(actions[:8, 0], torch.full((8,), 0.04 / 8 / 0.02))
     assert bool((actions[8:, 0] < 0.0).all())
     assert not actions[:, 1:].any()
+
+
+def test_a_stroke_comes_down_and_goes_along_and_lifts_at_the_end() -> None:
+    room = make_room(make_stage(PEN))
+    stroke = TouchStroke(tool=0, contact=np.array([0.55, 0.4, 0.5]), direction=np.array([0.03, 0.5, 0.04]), way=0.06, depth=0.02)
+    found = place(stroke, room, steps=10)
+    assert found is not None
+    poses, actions = found
+    top = float(room.particles[:, 1].max())
+    assert poses[0, [0, 2]].tolist() == pytest.approx([0.55, 0.5])
+    assert float(poses[0, 1]) == pytest.approx(top + 0.5 * PEN["height"] + PEN["radius"], abs=0.01)
+    moved = 0.02 * actions
+    assert not actions[:2, [0, 2]].any()
+    assert float(moved[:2, 1].sum()) == pytest.approx(-0.02)
+    # The rest of its way is level, along the level part of the direction.
+    assert moved[2:8].sum(dim=0).tolist() == pytest.approx([0.036, 0.0, 0.048], abs=1e-6)
+    assert not actions[8:, [0, 2]].any()
+    assert bool((actions[8:, 1] > 0.0).all())
+
+
+def test_strokes_are_drawn_where_clay_is_to_go_down_by_a_single_round_tool_that_can() -> None:
+    stage = make_stage(PEN)
+    down = torch.where(stage.state.position[0, :, 2:] > 0.5, torch.tensor([0.0, -0.03, 0.0]), torch.zeros(3))
+    stage = dataclasses.replace(stage, transport=transport_of(down.norm(dim=1), down))
+    proposals = [item for item in PlacerTouch(count=60).ask(stage) if item.label == "stroke"]
+    assert len(proposals) > 10
+    ends = [item.pose[0, :3] + 0.02 * item.actions[:8].sum(dim=0) for item in proposals if item.actions is not None]
+    assert all(float(place[2]) > 0.49 for item, end in zip(proposals, ends, strict=True) for place in (item.pose[0], end))
+    for tools in ((BALL,), (BLADE,), (PEN, PEN)):
+        assert "stroke" not in {item.label for item in PlacerTouch(count=40).ask(make_stage(*tools))}
 
 
 def test_a_way_that_is_too_long_keeps_its_direction() -> None:

@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 from cpdeform.placement.touches.drag import TouchDrag
 from cpdeform.placement.touches.pinch import TouchPinch
 from cpdeform.placement.touches.push import TouchPress, TouchPush
+from cpdeform.placement.touches.stroke import TouchStroke
 from cpdeform.placement.touches.together import TouchTogether
 from cpdeform.placement.touches.touch import Touch, Vector
 
 KINDS = ("push", "press", "drag", "none")
 SHARES = (0.45, 0.3, 0.15, 0.1)
 """What a single tool does, and how often."""
+
+STROKE_SHARE = 0.4
+"""How often the only tool, a round one, draws a stroke instead."""
 
 PINCH_SHARE = 0.4
 """How often two tools pinch instead of each doing something of its own."""
@@ -35,6 +39,7 @@ class TouchDraw:
         tools: Indices of the movable tools.
         reach: The longest way of a tool, length units.
         generator: Source of randomness.
+        strokes: Whether a tool may draw strokes.
     """
 
     particles: NDArray[np.float64]
@@ -42,12 +47,15 @@ class TouchDraw:
     tools: tuple[int, ...]
     reach: float
     generator: np.random.Generator
+    strokes: bool = False
 
     def draw(self) -> Touch:
         """A touch of one or several tools."""
         if len(self.tools) >= 2 and self.generator.random() < PINCH_SHARE:
             first, second = self.generator.permutation(self.tools)[:2].tolist()
             return self._pinch((first, second))
+        if self.strokes and self.generator.random() < STROKE_SHARE:
+            return self._stroke(int(self.generator.choice(self.tools)))
         parts: list[Touch] = []
         while not parts:
             drawn = [self._single(tool) for tool in self.tools]
@@ -73,6 +81,17 @@ class TouchDraw:
         side = float(generator.uniform(0.0, 2.0 * math.pi)) if any_side else float(generator.choice([0.0, math.pi]))
         closing = self._way(0.05, 0.4)
         return TouchDrag(tool=tool, contact=contact, direction=direction, way=self._way(0.4, 1.0), side=side, closing=closing)
+
+    def _stroke(self, tool: int) -> TouchStroke:
+        """From a place where the clay is to go down towards another one within reach."""
+        lower = np.clip(-self.displacements[:, 1], 0.0, None)
+        contact, direction = self._contact(lower)
+        distances = np.linalg.norm((self.particles - contact)[:, [0, 2]], axis=1)
+        weights = lower * (distances < self.reach) * (distances > 0.1 * self.reach)
+        if weights.any():
+            end, _ = self._contact(weights)
+            direction = end - contact
+        return TouchStroke(tool=tool, contact=contact, direction=direction, way=self._way(0.2, 1.0), depth=self._way(0.05, 0.5))
 
     def _pinch(self, tools: tuple[int, int]) -> TouchPinch:
         generator = self.generator

@@ -18,7 +18,7 @@ from cpdeform.placement.grid import movable_tools
 from cpdeform.placement.touches.draw import LONGEST_WAY, TouchDraw
 from cpdeform.placement.touches.parking import parked
 from cpdeform.placement.touches.together import label
-from cpdeform.placement.touches.touch import Room, Touch
+from cpdeform.placement.touches.touch import Move, Room, Touch
 
 BACK_SHARE = 0.2
 """Share of a touch's steps in which the tools back off at its end."""
@@ -54,9 +54,9 @@ class PlacerTouch(Placer):
     """Proposes many touches, to be screened by rollouts, then variations of those that did best.
 
     A touch is a placement and a first motion in a few numbers: a push, a press from above, a drag along a side, a pinch of two
-    tools, or several at once. Contacts are drawn with the probability of how far transport (cost |x - y|^2) wants to move a
-    particle: the paper's priority as a prior. Tools begin free of the clay and above the floor, and back off at the end. Lengths
-    follow from the clay's volume and from what the tools can do in a stage.
+    tools, a stroke of a round tool that is the only one, or several at once. Contacts are drawn with the probability of how far
+    transport (cost |x - y|^2) wants to move a particle: the paper's priority as a prior. Tools begin free of the clay and above
+    the floor, and back off at the end. Lengths follow from the clay's volume and from what the tools can do in a stage.
 
     Args:
         count: Random touches of a stage.
@@ -161,12 +161,23 @@ def place(touch: Touch, room: Room, *, steps: int) -> tuple[Tensor, Tensor] | No
     for index, tool in enumerate(room.scene.tools):
         if index in moves:
             poses[index] = moves[index].pose
-            command = _command(tool, moves[index].way / going)
-            actions[:going, offset : offset + 3] = command
-            actions[going:, offset : offset + 3] = -BACK_SPEED * command
+            commands = _commands(tool, moves[index], going)
+            actions[:going, offset : offset + 3] = commands
+            # Back along the way by which it came to the clay.
+            actions[going:, offset : offset + 3] = -BACK_SPEED * commands[0]
         offset += tool.action_size
     # A tool that cannot go where the touch would have it makes none.
     return (poses, actions) if bool(actions.any()) else None
+
+
+def _commands(tool: Tool, move: Move, steps: int) -> Tensor:
+    """Actions (steps, 3) that move a tool along its way, and then along the next one; each has its share of the steps."""
+    if move.then is None or steps < 2:
+        return _command(tool, move.way / steps).expand(steps, 3)
+    first, second = (float(torch.linalg.vector_norm(way)) for way in (move.way, move.then))
+    count = min(max(1, round(steps * first / (first + second))), steps - 1)
+    legs = ((move.way, count), (move.then, steps - count))
+    return torch.cat([_command(tool, way / number).expand(number, 3) for way, number in legs])
 
 
 def _command(tool: Tool, step: Tensor) -> Tensor:
@@ -201,8 +212,15 @@ def _begin(stage: Stage) -> _Search:
         tools=tuple(movable),
         reach=min(LONGEST_WAY * edge, (1.0 - BACK_SHARE) * speed * stage.step_count),
         generator=np.random.default_rng(seed),
+        strokes=len(movable) == 1 and _draws_strokes(stage.scene.tools[movable[0]]),
     )
     return _Search(stage, room, draw)
+
+
+def _draws_strokes(tool: Tool) -> bool:
+    """Whether a tool is round and can come down and move along."""
+    level, down, across = tool.action_scale[:3]
+    return tool.thinnest_axis is None and down > 0.0 and max(level, across) > 0.0 and not isinstance(tool, ToolRollingPin)
 
 
 def _clay_volume(scene: Scene) -> float:

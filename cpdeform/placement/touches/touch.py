@@ -36,10 +36,12 @@ class Move:
     Attributes:
         pose: Its pose (8,) at the beginning.
         way: Where it goes from there, a vector (3,), length units.
+        then: Where it goes after that; None for nowhere.
     """
 
     pose: Tensor
     way: Tensor
+    then: Tensor | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
