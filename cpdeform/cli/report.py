@@ -44,7 +44,7 @@ def draw(
     ] = "default",
     what: Annotated[
         list[str] | None,
-        typer.Option(help="picture, sheet, curves, mp4 or gif; repeatable. Defaults to all but gif.", metavar="NAME"),
+        typer.Option(help="picture, sheet, curves, mp4, gif or heights; repeatable. Defaults to the first four.", metavar="NAME"),
     ] = None,
 ) -> None:
     """Draw the pictures of a run into its record: picture, contact sheet of all stages, learning curves, animation.
@@ -55,12 +55,12 @@ def draw(
       cpdeform draw runs/star --what sheet --camera top
     """
     from cpdeform.core.errors import InputError
-    from cpdeform.report.draw import PICTURES, draw_chosen
+    from cpdeform.report.draw import PICTURES, USUAL, draw_chosen
 
     for name in what or ():
         if name not in PICTURES:
             raise InputError("--what", came=f'"{name}"', expected=", ".join(PICTURES))
-    for path in draw_chosen(directory, tuple(what or PICTURES[:-1]), camera=camera):
+    for path in draw_chosen(directory, tuple(what or USUAL), camera=camera):
         typer.echo(str(path))
 
 

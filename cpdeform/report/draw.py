@@ -6,12 +6,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cpdeform.report.animation import draw_animation
+from cpdeform.report.heights import draw_heights
 from cpdeform.report.pictures import draw_picture
 from cpdeform.report.sheet import draw_curves, draw_sheet
 from cpdeform.run.record import load_record
 
-PICTURES = ("picture", "sheet", "curves", "mp4", "gif")
+PICTURES = ("picture", "sheet", "curves", "mp4", "gif", "heights")
 """What can be drawn."""
+
+USUAL = ("picture", "sheet", "curves", "mp4")
+"""What is drawn unless something else is asked for."""
 
 
 def draw_run(directory: Path | str, *, camera: str | tuple[float, float] = "default") -> Path:
@@ -54,5 +58,6 @@ def draw_chosen(directory: Path | str, names: tuple[str, ...], *, camera: str | 
         "curves": lambda: draw_curves(record),
         "mp4": lambda: draw_animation(record, camera=camera, form="mp4"),
         "gif": lambda: draw_animation(record, camera=camera, form="gif"),
+        "heights": lambda: draw_heights(record),
     }
     return [path for name in names if (path := makers[name]()) is not None]
