@@ -19,7 +19,6 @@ from cpdeform.placement.touches.parking import parked
 from cpdeform.placement.touches.pinch import TouchPinch
 from cpdeform.placement.touches.placer import PlacerTouch, place
 from cpdeform.placement.touches.push import TouchPress, TouchPush
-from cpdeform.placement.touches.squeeze import TouchSqueeze
 from cpdeform.placement.touches.stroke import TouchStroke
 from cpdeform.placement.touches.touch import Room, facing
 from cpdeform.testing.placer import transport_of
@@ -76,7 +75,7 @@ def test_tools_begin_free_of_the_clay_and_of_each_other(tools) -> None:
                 distance = float((pose[:3] - proposal.pose[other, :3]).norm())
                 assert distance > 0.02
     if len(tools) == 2:
-        assert {"push", "pinch", "squeeze"} <= {part for proposal in proposals for part in proposal.label.split("+")}
+        assert {"push", "pinch"} <= {part for proposal in proposals for part in proposal.label.split("+")}
 
 
 def test_contacts_lie_where_the_clay_has_far_to_go() -> None:
@@ -198,30 +197,6 @@ def test_a_pinch_closes_from_both_sides() -> None:
     for index in (0, 1):
         face = rotate(moves[index].pose[3:7], torch.tensor([1.0, 0.0, 0.0]))
         assert abs(float(face[2])) == pytest.approx(1.0, abs=1e-4)
-
-
-def test_a_squeeze_closes_along_the_way_that_the_clay_has_to_go() -> None:
-    stage = make_stage(BLADE, BLADE)
-    room = make_room(stage)
-    direction = np.array([0.6, 0.0, 0.8])
-    squeeze = TouchSqueeze(
-        tools=(1, 0), contact=np.array([0.55, 0.35, 0.45]), direction=direction, tilts=(0.0, 0.0), closings=(0.03, 0.01)
-    )
-    moves = squeeze.moves(room)
-    assert moves is not None
-    assert moves[1].way.tolist() == pytest.approx((0.03 * direction).tolist(), abs=1e-6)
-    assert moves[0].way.tolist() == pytest.approx((-0.01 * direction).tolist(), abs=1e-6)
-    # One stands before the clay and one behind it, both on the line through the contact, and their faces are across it.
-    places = torch.stack([moves[index].pose[:3] for index in (1, 0)]) - torch.tensor(squeeze.contact).float()
-    along = places @ torch.tensor(direction).float()
-    assert float(along[0]) < 0.0 < float(along[1])
-    assert float((places - along[:, None] * torch.tensor(direction).float())[:, [0, 2]].abs().max()) < 1e-5
-    for index in (0, 1):
-        face = rotate(moves[index].pose[3:7], torch.tensor([1.0, 0.0, 0.0]))
-        assert abs(float(face @ torch.tensor(direction).float())) == pytest.approx(1.0, abs=1e-4)
-    tilted = dataclasses.replace(squeeze, tilts=(0.2, 0.0)).moves(room)
-    assert tilted is not None
-    assert float(torch.nn.functional.cosine_similarity(tilted[1].way, moves[1].way, dim=0)) == pytest.approx(np.cos(0.2), abs=1e-5)
 
 
 def test_blades_face_where_they_push_and_stay_upright() -> None:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from cpdeform.placement.touches.drag import TouchDrag
 from cpdeform.placement.touches.pinch import TouchPinch
 from cpdeform.placement.touches.push import TouchPress, TouchPush
-from cpdeform.placement.touches.squeeze import TouchSqueeze
 from cpdeform.placement.touches.stroke import TouchStroke
 from cpdeform.placement.touches.together import TouchTogether
 from cpdeform.placement.touches.touch import Touch, Vector
@@ -23,8 +22,8 @@ SHARES = (0.45, 0.3, 0.15, 0.1)
 STROKE_SHARE = 0.4
 """How often the only tool, a round one, draws a stroke instead."""
 
-PINCH_SHARE, SQUEEZE_SHARE = 0.3, 0.2
-"""How often two tools pinch, and squeeze, instead of each doing something of its own."""
+PINCH_SHARE = 0.4
+"""How often two tools pinch instead of each doing something of its own."""
 
 LONGEST_WAY = 0.45
 """The longest way of a tool, in edges of a cube of the clay's volume."""
@@ -52,10 +51,9 @@ class TouchDraw:
 
     def draw(self) -> Touch:
         """A touch of one or several tools."""
-        share = self.generator.random() if len(self.tools) >= 2 else 1.0
-        if share < PINCH_SHARE + SQUEEZE_SHARE:
+        if len(self.tools) >= 2 and self.generator.random() < PINCH_SHARE:
             first, second = self.generator.permutation(self.tools)[:2].tolist()
-            return self._pinch((first, second)) if share < PINCH_SHARE else self._squeeze((first, second))
+            return self._pinch((first, second))
         if self.strokes and self.generator.random() < STROKE_SHARE:
             return self._stroke(int(self.generator.choice(self.tools)))
         parts: list[Touch] = []
@@ -109,21 +107,6 @@ class TouchDraw:
             pull=self._way(0.0, 1.0 if generator.random() < 0.3 else 0.6),
         )
 
-    def _squeeze(self, tools: tuple[int, int]) -> TouchSqueeze:
-        generator = self.generator
-        contact, direction = self._contact(np.linalg.norm(self.displacements, axis=1))
-        tilts = 0.1 * generator.standard_normal(2)
-        upright = generator.random() < 0.8
-        return TouchSqueeze(
-            tools=tools,
-            contact=contact,
-            direction=direction,
-            tilts=(float(tilts[0]), float(tilts[1])),
-            closings=(self._way(0.1, 0.8), self._way(0.0, 0.5)),
-            edge=bool(generator.random() < 0.3),
-            roll=0.2 * float(generator.standard_normal()) if upright else float(generator.uniform(0.0, math.pi)),
-        )
-
     def _way(self, least: float, most: float) -> float:
         """A length between two parts of the reach."""
         return float(self.generator.uniform(least, most)) * self.reach
@@ -133,6 +116,5 @@ class TouchDraw:
         total = float(weights.sum())
         shares = weights / total if total > 0.0 else np.full(len(weights), 1.0 / len(weights))
         index = int(self.generator.choice(len(weights), p=shares))
-        direction = self.displacements[index] + 1e-4 * self.generator.standard_normal(3)
-        # Exactly level: a tool that stands on the floor could not come from slightly below.
-        return self.particles[index], direction * ([1.0, 0.0, 1.0] if self.generator.random() < 0.5 else [1.0, 1.0, 1.0])
+        direction = self.displacements[index] * ([1.0, 0.0, 1.0] if self.generator.random() < 0.5 else [1.0, 1.0, 1.0])
+        return self.particles[index], direction + 1e-4 * self.generator.standard_normal(3)
