@@ -1,9 +1,9 @@
 """Draw all pictures of README and docs: `make pictures`, or some: `python scripts/draw_docs.py writer page goals-multi-stage-1`.
 
 ``writer`` is a run of the task writer, ``sculpted`` and ``sculpted-2`` show runs of tasks of several stages, ``meshes`` those
-of three meshes, ``page`` is a screenshot of the page of one of them (a headless Chromium is needed); each of these runs takes 10 to
-40 minutes. The others are the sheets of all tasks. Runs are kept in ``runs/pictures``: those that are finished are drawn again
-without being made again. Delete the folder to make them anew.
+of three meshes, ``letters`` the heights of a board that was written on, ``page`` is a screenshot of the page of one of them (a
+headless Chromium is needed); each of these runs takes 10 to 60 minutes. The others are the sheets of all tasks. Runs are kept in
+``runs/pictures``: those that are finished are drawn again without being made again. Delete the folder to make them anew.
 """
 
 from __future__ import annotations
@@ -56,6 +56,13 @@ def draw_writer() -> None:
     directory = run("writer")
     command("draw", str(directory), "--what", "picture")
     shrink((directory / "picture.png").read_bytes(), DOCS / "writer.png")
+
+
+def draw_letters() -> None:
+    """Heights of the board of writer++: start, result and goal."""
+    directory = run("writer++")
+    command("draw", str(directory), "--what", "heights")
+    shrink((directory / "heights.png").read_bytes(), DOCS / "pictures" / "letters.png")
 
 
 def draw_sculpted(picture: str) -> None:
@@ -158,7 +165,7 @@ def command(*arguments: str) -> None:
 
 def main() -> None:
     """Draw what the command line names, or everything."""
-    makers: dict[str, Callable[[], None]] = {"writer": draw_writer, "page": draw_page}
+    makers: dict[str, Callable[[], None]] = {"writer": draw_writer, "letters": draw_letters, "page": draw_page}
     makers |= {picture: lambda picture=picture: draw_sculpted(picture) for picture in SCULPTED}
     makers |= {name: lambda name=name: draw_sheet(name) for name in SHEETS}
     names = sys.argv[1:] or list(makers)
