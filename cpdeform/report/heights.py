@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +79,7 @@ def draw_heights(record: RunRecord) -> Path:
     }
     least, most = np.nanpercentile(reliefs["goal"], SHOWN)
     wide = (window[1] - window[0]) / (window[3] - window[2]) > 1.0
-    figure = Figure(figsize=(6.4, 8.6) if wide else (10.5, 4.2), dpi=110, layout="constrained", facecolor="white")
+    figure = Figure(figsize=(6.4, 7.2) if wide else (10.5, 4.2), dpi=110, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots(*((3, 1) if wide else (1, 3)))
     for axis, (name, heights) in zip(axes, reliefs.items(), strict=True):
@@ -86,7 +87,7 @@ def draw_heights(record: RunRecord) -> Path:
         axis.set_title(name, fontsize=10)
         axis.set_axis_off()
     figure.colorbar(picture, ax=axes, shrink=0.6, label="height, domain edges")
-    figure.suptitle(describe(record), fontsize=10)
+    figure.suptitle("\n".join(textwrap.wrap(describe(record), 64 if wide else 110)), fontsize=10)
     path = record.directory / "heights.png"
     with replacing(path) as temporary:
         canvas.print_figure(temporary, format="png")

@@ -57,12 +57,12 @@ def test_the_picture_of_a_run(record):
 def test_the_goal_of_writer_can_be_read(tmp_path):
     goal = torch.as_tensor(load_task("writer++").load_goal()).double().numpy()
     # The board's edges are no part of the word.
-    window = np.add(window_around(goal), (0.034, -0.034, 0.034, -0.034))
+    window = np.add(window_around(goal), (0.04, -0.04, 0.04, -0.04))
     heights = height_map(goal, window=tuple(window))
-    top, bottom = np.nanpercentile(heights, (40.0, 2.0))
+    top, bottom = np.nanpercentile(heights, (50.0, 2.0))
     level = np.clip((np.nan_to_num(heights, nan=top) - bottom) / (top - bottom), 0.0, 1.0)
     picture = np.pad((255.0 * level).repeat(3, axis=0).repeat(3, axis=1), 40, constant_values=255.0)
     imageio.v2.imwrite(tmp_path / "heights.png", picture.astype(np.uint8))
     letters = "tessedit_char_whitelist=ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-    command = ["tesseract", str(tmp_path / "heights.png"), "-", "--psm", "7", "-c", letters]
+    command = ["tesseract", str(tmp_path / "heights.png"), "-", "--psm", "8", "-c", letters]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == "ICLR"
