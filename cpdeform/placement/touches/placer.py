@@ -12,7 +12,7 @@ from cpdeform.core.errors import InputError
 from cpdeform.core.ot import TransportProblem
 from cpdeform.core.placer import Candidate, Placer, PlacerCapabilities, Proposal, Stage
 from cpdeform.core.priorities import DISPLACEMENT_EXPONENT
-from cpdeform.core.scene import Scene, Tool, ToolRollingPin
+from cpdeform.core.scene import Scene, Tool, ToolCapsule, ToolCylinder, ToolRollingPin, ToolSphere
 from cpdeform.core.tool_surface import ToolSurfaces
 from cpdeform.placement.grid import movable_tools
 from cpdeform.placement.touches.draw import LONGEST_WAY, TouchDraw
@@ -218,9 +218,9 @@ def _begin(stage: Stage) -> _Search:
 
 
 def _draws_strokes(tool: Tool) -> bool:
-    """Whether a tool is round and can come down and move along."""
+    """Whether a tool is a ball or a pen and can come down and move along."""
     level, down, across = tool.action_scale[:3]
-    return tool.thinnest_axis is None and down > 0.0 and max(level, across) > 0.0 and not isinstance(tool, ToolRollingPin)
+    return isinstance(tool, (ToolSphere, ToolCapsule, ToolCylinder)) and down > 0.0 and max(level, across) > 0.0
 
 
 def _clay_volume(scene: Scene) -> float:
