@@ -3,32 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
 
-from cpdeform.placement.touches.touch import Move, Room, Touch, Vector, aside, facing, moved, scaled, turned_aside, unit
+from cpdeform.placement.touches.touch import Move, Room, TouchSingle, aside, facing, scaled, unit
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TouchDrag(Touch):
+class TouchDrag(TouchSingle):
     """One tool beside the clay closes in a little and moves along.
 
     Attributes:
-        tool: Index of the tool.
-        contact: Contact point (3,), length units.
-        direction: Where it drags the clay (3,).
-        way: How far, length units.
         side: On which side it is, an angle about the direction, radians; see `aside`.
         closing: How far it closes in, length units.
     """
 
     name: ClassVar[str] = "drag"
-    tool: int
-    contact: Vector
-    direction: Vector
-    way: float
     side: float
     closing: float
 
@@ -40,13 +32,8 @@ class TouchDrag(Touch):
         pose = room.behind(self.tool, rotation, torch.as_tensor(self.contact).to(direction), inward)
         return None if pose is None else {self.tool: Move(pose, self.way * direction + self.closing * inward)}
 
-    def varied(self, generator: np.random.Generator, width: float) -> TouchDrag:
+    def varied(self, generator: np.random.Generator, width: float) -> Self:
         """See `Touch`."""
-        return dataclasses.replace(
-            self,
-            contact=moved(self.contact, generator, width),
-            direction=turned_aside(self.direction, generator, width),
-            way=scaled(self.way, generator, width),
-            side=self.side + 0.12 * width * float(generator.standard_normal()),
-            closing=scaled(self.closing, generator, width),
-        )
+        near = super().varied(generator, width)
+        side = self.side + 0.12 * width * float(generator.standard_normal())
+        return dataclasses.replace(near, side=side, closing=scaled(self.closing, generator, width))

@@ -20,7 +20,7 @@ SHARES = (0.45, 0.3, 0.15, 0.1)
 """What a single tool does, and how often."""
 
 STROKE_SHARE = 0.4
-"""How often the only tool, a round one, draws a stroke instead."""
+"""How often the only tool, a ball or a pen, draws a stroke instead."""
 
 PINCH_SHARE = 0.4
 """How often two tools pinch instead of each doing something of its own."""
@@ -39,7 +39,7 @@ class TouchDraw:
         tools: Indices of the movable tools.
         reach: The longest way of a tool, length units.
         generator: Source of randomness.
-        strokes: Whether a tool may draw strokes.
+        strokes: Whether the only tool may draw strokes.
     """
 
     particles: NDArray[np.float64]
@@ -55,7 +55,7 @@ class TouchDraw:
             first, second = self.generator.permutation(self.tools)[:2].tolist()
             return self._pinch((first, second))
         if self.strokes and self.generator.random() < STROKE_SHARE:
-            return self._stroke(int(self.generator.choice(self.tools)))
+            return self._stroke(self.tools[0])
         parts: list[Touch] = []
         while not parts:
             drawn = [self._single(tool) for tool in self.tools]

@@ -54,7 +54,7 @@ class PlacerTouch(Placer):
     """Proposes many touches, to be screened by rollouts, then variations of those that did best.
 
     A touch is a placement and a first motion in a few numbers: a push, a press from above, a drag along a side, a pinch of two
-    tools, a stroke of a round tool that is the only one, or several at once. Contacts are drawn with the probability of how far
+    tools, a stroke of a ball or pen that is the only one, or several at once. Contacts are drawn with the probability of how far
     transport (cost |x - y|^2) wants to move a particle: the paper's priority as a prior. Tools begin free of the clay and above
     the floor, and back off at the end. Lengths follow from the clay's volume and from what the tools can do in a stage.
 

@@ -3,32 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
 
-from cpdeform.placement.touches.touch import Move, Room, Touch, Vector, facing, moved, scaled, turned_aside, unit
+from cpdeform.placement.touches.touch import Move, Room, TouchSingle, facing, unit
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TouchPush(Touch):
+class TouchPush(TouchSingle):
     """One tool pushes the clay around a contact point, with its broad face or its edge.
 
     Attributes:
-        tool: Index of the tool.
-        contact: Contact point (3,), length units.
-        direction: Where it pushes (3,).
-        way: How far, length units.
         edge: Whether a flat tool pushes with its edge.
         roll: Angle of a flat tool about the direction, radians.
     """
 
     name: ClassVar[str] = "push"
-    tool: int
-    contact: Vector
-    direction: Vector
-    way: float
     edge: bool = False
     roll: float = 0.0
 
@@ -39,15 +31,10 @@ class TouchPush(Touch):
         pose = room.behind(self.tool, rotation, torch.as_tensor(self.contact).to(direction), direction)
         return None if pose is None else {self.tool: Move(pose, self.way * direction)}
 
-    def varied(self, generator: np.random.Generator, width: float) -> TouchPush:
+    def varied(self, generator: np.random.Generator, width: float) -> Self:
         """See `Touch`."""
-        return dataclasses.replace(
-            self,
-            contact=moved(self.contact, generator, width),
-            direction=turned_aside(self.direction, generator, width),
-            way=scaled(self.way, generator, width),
-            roll=self.roll + 0.12 * width * float(generator.standard_normal()),
-        )
+        near = super().varied(generator, width)
+        return dataclasses.replace(near, roll=self.roll + 0.12 * width * float(generator.standard_normal()))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
 
-from cpdeform.placement.touches.touch import Move, Room, Touch, Vector, facing, moved, scaled, turned_aside, unit
+from cpdeform.placement.touches.touch import Move, Room, TouchSingle, facing, scaled, unit
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TouchStroke(Touch):
-    """One tool presses into the clay from above, then moves along a line on the level.
+class TouchStroke(TouchSingle):
+    """One tool presses into the clay from above at the contact, then moves along the part of the direction on the level.
 
     Attributes:
-        tool: Index of the tool.
-        contact: Where the groove begins (3,), length units.
-        direction: Where it goes (3,); its part on the level counts.
-        way: How far it goes, length units.
         depth: How far the tool comes down before, length units.
     """
 
     name: ClassVar[str] = "stroke"
-    tool: int
-    contact: Vector
-    direction: Vector
-    way: float
     depth: float
 
     def moves(self, room: Room) -> dict[int, Move] | None:
@@ -38,12 +30,7 @@ class TouchStroke(Touch):
         pose = room.behind(self.tool, rotation, torch.as_tensor(self.contact).to(down), down)
         return None if pose is None else {self.tool: Move(pose, self.depth * down, self.way * along)}
 
-    def varied(self, generator: np.random.Generator, width: float) -> TouchStroke:
+    def varied(self, generator: np.random.Generator, width: float) -> Self:
         """See `Touch`."""
-        return dataclasses.replace(
-            self,
-            contact=moved(self.contact, generator, width),
-            direction=turned_aside(self.direction, generator, width),
-            way=scaled(self.way, generator, width),
-            depth=scaled(self.depth, generator, width),
-        )
+        near = super().varied(generator, width)
+        return dataclasses.replace(near, depth=scaled(self.depth, generator, width))

@@ -6,7 +6,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -127,6 +127,32 @@ class Touch(abc.ABC):
             generator: Source of randomness.
             width: How far away, 1 for a wide search.
         """
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TouchSingle(Touch):
+    """A touch of one tool, along a direction.
+
+    Attributes:
+        tool: Index of the tool.
+        contact: Contact point (3,), length units.
+        direction: Where it moves the clay (3,); its length does not count.
+        way: How far, length units.
+    """
+
+    tool: int
+    contact: Vector
+    direction: Vector
+    way: float
+
+    def varied(self, generator: np.random.Generator, width: float) -> Self:
+        """See `Touch`."""
+        return dataclasses.replace(
+            self,
+            contact=moved(self.contact, generator, width),
+            direction=turned_aside(self.direction, generator, width),
+            way=scaled(self.way, generator, width),
+        )
 
 
 def facing(tool: Tool, direction: Tensor, *, edge: bool, roll: float) -> Tensor:
