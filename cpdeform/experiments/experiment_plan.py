@@ -221,7 +221,7 @@ def configure(
     Raises:
         InputError: The task, its goal or an option cannot be used.
     """
-    values = _values(_effective(settings, run.method, registry), run.source, METHODS[run.method], run.seed)
+    values = _values(_for_method(settings, run.method, registry), run.source, METHODS[run.method], run.seed)
     if iterations is not None:
         values = merge(values, {"optimizer": {"iterations": iterations, "patience": iterations}})
     values = merge(values, budget or {})
@@ -232,7 +232,7 @@ def configure(
     return resolve(validate(RunConfiguration, values, source="experiment"), registry=registry)
 
 
-def _effective(settings: ExperimentSettings, method: str, registry: Registry) -> ExperimentSettings:
+def _for_method(settings: ExperimentSettings, method: str, registry: Registry) -> ExperimentSettings:
     """The settings for a method: iterations that are meant for others of the experiment are left out, where it has its own."""
     strategy = METHODS[method].get("strategy")
     if strategy is None or len(settings.methods) == 1 or registry.load("strategy", strategy).takes_optimizer:

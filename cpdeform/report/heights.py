@@ -51,7 +51,14 @@ def height_map(particles: Array, *, window: tuple[float, float, float, float], s
 
 
 def window_around(*clouds: Array) -> tuple[float, float, float, float]:
-    """The smallest window around some clouds of particles (N, 3), with a little space; for `height_map`."""
+    """The smallest window around some clouds of particles, with a little space.
+
+    Args:
+        clouds: Positions (N, 3) each, length units.
+
+    Returns:
+        Least and greatest x, then least and greatest z, length units; for `height_map`.
+    """
     low = np.min([np.nanmin(cloud, axis=0) for cloud in clouds], axis=0) - AROUND
     high = np.max([np.nanmax(cloud, axis=0) for cloud in clouds], axis=0) + AROUND
     return float(low[0]), float(high[0]), float(low[2]), float(high[2])

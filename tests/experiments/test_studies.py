@@ -24,7 +24,6 @@ from cpdeform.experiments.studies.equal_cost import JUDGED, budget_values, known
 from cpdeform.experiments.studies.statistics import Interval, mean, rank_correlation
 from cpdeform.experiments.studies.study import PRESETS, STUDIES
 from cpdeform.experiments.studies.trace import learning_curve, stage_points, value_at
-from cpdeform.planning.strategies import sculpt
 from cpdeform.planning.strategies.sculpt import StrategySculpt
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record import load_record
@@ -121,18 +120,17 @@ def test_every_method_is_sized_for_the_budget(method, cost, share):
     assert gradients + share * rollouts == pytest.approx(cost, rel=0.35)
 
 
-@pytest.mark.parametrize("stages", [2, 3, 8, 12, 24])
-def test_descents_over_several_touches_are_within_the_budget(stages, monkeypatch):
-    monkeypatch.setattr(sculpt, "takes_final_gradient", lambda simulator: True)
+@pytest.mark.parametrize("stages", [2, 3, 8, 12, 14, 24])
+def test_descents_over_several_touches_are_within_the_budget(stages):
     cost, share = 60.0, 0.2
     options = budget_values("sculpt", cost, share=share, iterations=20, stages=stages)["strategy_options"]
     strategy = StrategySculpt(**options)
-    joint = strategy.joint_efforts(None, stages=stages)
+    joint = strategy.joint_descents(stages)
     assert joint[-1].after == stages
     gradients = sum(part.stages * part.iterations[1] for part in joint)
-    assert gradients == pytest.approx(equal_cost.JOINT_SHARE_OF_SEVERAL * cost * stages, rel=0.35)
+    assert gradients == pytest.approx(equal_cost.JOINT_SHARE_OF_SEVERAL * cost * stages, rel=0.15)
     gradients += stages * sum(math.prod(step) for step in zip(strategy.polished, strategy.iterations, strict=True))
-    assert gradients + stages * share * (strategy.touches + 2 * strategy.variations) == pytest.approx(cost * stages, rel=0.2)
+    assert gradients + stages * share * (strategy.touches + 2 * strategy.variations) == pytest.approx(cost * stages, rel=0.1)
 
 
 def test_the_search_study(folder):

@@ -16,7 +16,7 @@ from cpdeform.core.plugins import Registry
 from cpdeform.core.reading.json_text import read_json
 from cpdeform.core.task import Task
 from cpdeform.experiments.experiment_plan import plain_name
-from cpdeform.planning.strategies.sculpt import StrategySculpt, joint_optimizer
+from cpdeform.planning.strategies.sculpt import StrategySculpt
 from cpdeform.run.configuration import RunConfiguration
 from cpdeform.run.record_files import write_json
 
@@ -162,15 +162,12 @@ def _touches(cost: float, *, share: float, stages: int) -> dict[str, Any]:
     }
 
 
-def _joint_descents(full: StrategySculpt, cost: float, stages: int) -> tuple[dict[str, int], int]:
+def _joint_descents(full: StrategySculpt, cost: float, stages: int) -> tuple[dict[str, Any], int]:
     """Options of `sculpt` for joint descents, the last one twice as long as those on the way, and the gradients of all of them."""
-    together = min(stages, full.together)
+    chapters = math.ceil(stages / full.together)
+    together = math.ceil(stages / chapters)
     share = JOINT_SHARE if stages == 1 else JOINT_SHARE_OF_SEVERAL
-    chapters, parts = math.ceil(stages / together), math.ceil(together / full.joint_every)
-    interim = max(1, round(share * cost * stages / (chapters * (parts + 1))))
-    options = {"together": together, "interim_gradients": interim, "joint_gradients": 2 * interim}
-    lengths = [
-        joint_optimizer(stages=count, gradients=interim * (1 + (count == together))).iterations * count
-        for count in (min(number * full.joint_every, together) for number in range(1, parts + 1))
-    ]
-    return options, chapters * sum(lengths)
+    interim = max(1, round(share * cost * stages / (chapters * (math.ceil(together / full.joint_every) + 1))))
+    options: dict[str, Any] = {"together": together, "interim_gradients": interim, "joint_gradients": 2 * interim}
+    descents = StrategySculpt(**options).joint_descents(stages)
+    return options, sum(descent.effort.gradients[1] for descent in descents)

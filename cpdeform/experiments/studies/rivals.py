@@ -13,7 +13,7 @@ from cpdeform.experiments.shape_figures import SHAPE_NOTE
 from cpdeform.experiments.studies.figures import colour, new_figure
 from cpdeform.experiments.studies.runs import StudyRun, chosen, methods_of, tasks_of
 from cpdeform.experiments.studies.search import final_distance
-from cpdeform.experiments.studies.statistics import Interval, mean
+from cpdeform.experiments.studies.statistics import Interval, as_number, mean
 from cpdeform.experiments.studies.summary import INTERVAL_NOTE, Summary
 from cpdeform.experiments.studies.trace import stage_points
 from cpdeform.experiments.tables import cell, markdown
@@ -53,7 +53,7 @@ def _values(runs: Sequence[StudyRun], task: str, method: str, share: float) -> d
     difference = _difference(runs, task, method, REFERENCE)
     ratio = mean([_ratio_within(run, _seconds(other)) for run, other in _pairs(runs, task, method, REFERENCE)])
     line: dict[str, Any] = {"task": task, "method": method, "seeds": final.count, "rollout_share": share}
-    shape = mean([_number(run.row.normalised_shape_iou) for run in own])
+    shape = mean([as_number(run.row.normalised_shape_iou) for run in own])
     intervals = {"w1_final": final, "normalised_shape_iou": shape, "w1_minus_reference": difference, "loss_ratio_in_seconds": ratio}
     intervals["cost"] = mean([_cost(run, share) for run in own])
     intervals["seconds"] = mean([_seconds(run) for run in own])
@@ -62,12 +62,8 @@ def _values(runs: Sequence[StudyRun], task: str, method: str, share: float) -> d
     return line
 
 
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
 def _final(run: StudyRun) -> float:
-    return _number(run.row.w1_final)
+    return as_number(run.row.w1_final)
 
 
 def _cost(run: StudyRun, share: float) -> float:
@@ -96,7 +92,7 @@ def _table(
     paper = paper_figures("multi-stage")
     lines = []
     for task in tasks:
-        first = mean([_number(run.row.w1_initial) for run in runs if run.row.task == task])
+        first = mean([as_number(run.row.w1_initial) for run in runs if run.row.task == task])
         cells = []
         for method in methods:
             line = found[task, method]

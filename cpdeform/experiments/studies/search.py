@@ -10,7 +10,7 @@ from cpdeform.experiments.experiment import family
 from cpdeform.experiments.experiment_tables import paper_figures
 from cpdeform.experiments.studies.figures import colour, new_figure
 from cpdeform.experiments.studies.runs import StudyRun, chosen, methods_of, tasks_of
-from cpdeform.experiments.studies.statistics import Interval, mean
+from cpdeform.experiments.studies.statistics import Interval, as_number, mean
 from cpdeform.experiments.studies.summary import INTERVAL_NOTE, Summary
 from cpdeform.experiments.tables import cell, markdown
 
@@ -23,9 +23,9 @@ def summarize(runs: Sequence[StudyRun]) -> Summary:
     for task in tasks:
         own = {method: final_distance(runs, task, method) for method in methods}
         efforts = {
-            method: mean([_number(run.row.gradient_evaluations) for run in chosen(runs, task, method)]) for method in methods
+            method: mean([as_number(run.row.gradient_evaluations) for run in chosen(runs, task, method)]) for method in methods
         }
-        first = mean([_number(run.row.w1_initial) for run in runs if run.row.task == task])
+        first = mean([as_number(run.row.w1_initial) for run in runs if run.row.task == task])
         cells = [f"{own[method].text('.4f')}, {efforts[method].value:.0f}" for method in methods]
         lines.append([task, cell(first.value, ".4f"), *cells, cell(paper.tasks.get(family(task)), ".4f")])
         values += [_line(task, method, own[method], efforts[method]) for method in methods]
@@ -37,7 +37,7 @@ def summarize(runs: Sequence[StudyRun]) -> Summary:
 
 def final_distance(runs: Sequence[StudyRun], task: str, method: str) -> Interval:
     """W1 at the end of the runs that came to their end."""
-    return mean([_number(run.row.w1_final) for run in chosen(runs, task, method) if run.row.over])
+    return mean([as_number(run.row.w1_final) for run in chosen(runs, task, method) if run.row.over])
 
 
 def _line(task: str, method: str, final: Interval, effort: Interval) -> dict[str, Any]:
@@ -57,7 +57,7 @@ def _draw(runs: Sequence[StudyRun], tasks: Sequence[str], methods: Sequence[str]
     width = 0.8 / max(len(methods), 1)
     for number, method in enumerate(methods):
         for place, task in enumerate(tasks):
-            first = mean([_number(run.row.w1_initial) for run in runs if run.row.task == task]).value
+            first = mean([as_number(run.row.w1_initial) for run in runs if run.row.task == task]).value
             found = final_distance(runs, task, method)
             if not math.isfinite(found.value):
                 continue
@@ -71,7 +71,3 @@ def _draw(runs: Sequence[StudyRun], tasks: Sequence[str], methods: Sequence[str]
     axis.set_ylabel("W1 at the end / at the start")
     figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize=8, frameon=False)
     return figure
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)

@@ -47,6 +47,11 @@ class Interval:
         return self.known and (self.low > 0.0 or self.high < 0.0)
 
 
+def as_number(value: float | None) -> float:
+    """A figure of a row: nan for one that is not known, which means leave out."""
+    return math.nan if value is None else float(value)
+
+
 def mean(values: Sequence[float]) -> Interval:
     """Mean with its bootstrap interval (percentiles of the means of resamples [1]_).
 

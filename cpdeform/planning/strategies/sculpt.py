@@ -141,9 +141,18 @@ class StrategySculpt(Strategy):
         return _from_rest(objective, first, _settled(simulator, goal))
 
     def joint_efforts(self, simulator: Simulator, *, stages: int) -> tuple[JointEffort, ...]:
-        """See `Strategy`; each goes over all stages found since the last chapter."""
-        if not takes_final_gradient(simulator):
-            return ()
+        """See `Strategy`."""
+        return self.joint_descents(stages) if takes_final_gradient(simulator) else ()
+
+    def joint_descents(self, stages: int) -> tuple[JointEffort, ...]:
+        """The joint descents of a run in which every stage finds a plan; each goes over all stages since the last chapter.
+
+        Args:
+            stages: Stages of the run.
+
+        Returns:
+            In the order in which they come.
+        """
         efforts = []
         for chapter in _parts(range(stages), self.together):
             for part in _parts(chapter, self.joint_every):
