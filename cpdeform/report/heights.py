@@ -43,7 +43,9 @@ def height_map(particles: Array, *, window: tuple[float, float, float, float], s
     left, right, back, front = window
     shape = (max(1, round((front - back) / PIXEL)), max(1, round((right - left) / PIXEL)))
     heights = np.full(shape, -np.inf)
-    points = sample_mesh(clay_surface(particles, spacing=spacing, smoothing=SMOOTHING), 0.7 * PIXEL)[0]
+    mesh = clay_surface(particles, spacing=spacing, smoothing=SMOOTHING)
+    # Crumbs, which no surface shows, are dots.
+    points = np.concatenate([sample_mesh(mesh, 0.7 * PIXEL)[0], particles[mesh.loose]])
     rows, columns = (np.floor((points[:, axis] - low) / PIXEL).astype(np.int64) for axis, low in ((2, back), (0, left)))
     inside = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
     np.maximum.at(heights, (rows[inside], columns[inside]), points[inside, 1])

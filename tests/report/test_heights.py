@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import subprocess
 
@@ -37,6 +38,17 @@ def test_heights_of_a_board_with_a_groove():
     # Seen from above the board has no holes.
     assert np.isfinite(heights[row(0.42) : row(0.58), column - 80 : column + 80]).all()
     assert not np.isfinite(height_map(points[:0], window=window)).any()
+
+
+def test_clay_without_a_surface_is_dots(record):
+    crumbs = np.array([[0.3, 0.1, 0.4], [0.6, 0.3, 0.5]])
+    window = window_around(crumbs)
+    heights = height_map(crumbs, window=window)
+    rows, columns = np.nonzero(np.isfinite(heights))
+    assert sorted(heights[rows, columns]) == [0.1, 0.3]
+    np.testing.assert_allclose(np.sort(window[0] + PIXEL * columns), [0.3, 0.6], atol=PIXEL)
+    sparse = dataclasses.replace(load_record(record(stages=1)), goal=torch.from_numpy(crumbs))
+    assert imageio.v2.imread(draw_heights(sparse)).std() > 10.0
 
 
 def test_a_shifted_board_is_shifted_in_the_picture():
